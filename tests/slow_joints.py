@@ -107,9 +107,21 @@ def closed(*logs: tuple[Log, Motion], **options) -> QuasiStaticLoop:
     return close_loop(points_of([log for log, _ in logs], [how for _, how in logs], RATIO), **options)
 
 
-def ripple(amplitude: float, order: int, phase: float = 0.7) -> Effect:
-    """Kinematic error: it acts on the spring, and encoders do not measure it."""
-    return lambda motion: -amplitude * np.cos(order * motion.motor + phase)
+def ripple(amplitude: float, order: int, phase: float = 0.7, *, share: float = 0.0) -> Effect:
+    """Kinematic error: it acts on the spring, and encoders do not measure it.
+
+    Args:
+        amplitude: [rad].
+        order: Periods per turn of the motor.
+        phase: [rad].
+        share: Of the twist between the motor and the place of the error; 1 for a function of N theta_l.
+    """
+    return lambda motion: -amplitude * np.cos(order * (motion.motor - share * RATIO * motion.torque / K) + phase)
+
+
+def soft_spots(depth: float, order: int) -> Effect:
+    """Position-dependent stiffness: compliance that varies with the motor's angle."""
+    return lambda motion: depth * np.cos(order * motion.motor) * motion.torque / K
 
 
 def sliders(width: float, yields: Sequence[float] = (4.0, 10.0)) -> Effect:

@@ -39,7 +39,7 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     peaks = _peaks(ratio)
     strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
     step = float(np.median(np.diff(fit.stretches[0].experiment.time)))
-    return tuple((2.0 * np.pi * ((strongest + _off_the_grid(power, strongest)) / (2 * count * step))).tolist())
+    return tuple((2.0 * np.pi * ((strongest + off_the_grid(power, strongest)) / (2 * count * step))).tolist())
 
 
 def _peaks(ratio: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def without_lines(spectrum: np.ndarray) -> np.ndarray:
     return spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
 
 
-def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarray:
+def off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarray:
     """Distance of each line from its highest grid frequency: the vertex of the parabola through the logarithms.
     Held-out data come later in time, where a frequency error has become a phase error."""
     inner = np.clip(peaks, 1, power.size - 2)

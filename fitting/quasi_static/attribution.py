@@ -93,8 +93,10 @@ class Held:
         return TwistTrial(model, hold_out(self.points, model, self.fold))
 
     def beside(self, trial: TwistTrial, terms: Terms) -> TwistTrial:
-        """The model with further terms."""
-        return self.attempt((*trial.model.terms, *(term for term in terms if term[0] not in trial.model.forms)))
+        """The model with further terms, less the forms of which it then has a generalisation."""
+        every = (*trial.model.terms, *(term for term in terms if term[0] not in trial.model.forms))
+        included = {form.includes for form, _ in every}
+        return self.attempt(tuple(term for term in every if term[0].name not in included))
 
     def without(self, trial: TwistTrial, forms: Sequence[Form]) -> TwistTrial:
         """The model without some of its forms."""
@@ -126,34 +128,42 @@ def look(
             it fall.
     """
     screened = screen(held.points, before.model, choices, held.fold, seed)
-    verdicts = []
-    for lead in _worth_a_refit(screened):
-        trial = held.beside(before, lead.terms)
-        gain = trial.gain_over(before)
-        # The null distribution is that of the grid of shapes; further gain by the search between grid points is not
-        # counted.
-        p_value = screened.p_value(min(gain, lead.gain))
-        name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
-        verdicts.append(Verdict(name, family, trial, gain, p_value, True))
+    verdicts = [_refit(held, before, lead, screened) for lead in _worth_a_refit(screened)]
     if elastic:
         # Physically, the twist rises with the torque.
         verdicts = [v for v in verdicts if v.trial.model.coefficients[0] > 0]
     verdicts.sort(key=lambda verdict: -verdict.gain)
-    if not verdicts:
+    if verdicts:
+        best = verdicts[0]
+        asked = [_evidence(best.trial.beyond(before), best.gain, best.p_value)]
+    else:
         asked = [_evidence(lead.forms, lead.gain, screened.p_value(lead.gain)) for lead in screened.leads[:1]]
-        return Round(before, screened, (), False, RoundEvidence(tuple(asked), {}, ()))
-    seen = _evidence(verdicts[0].trial.beyond(before), verdicts[0].gain, verdicts[0].p_value)
-    if not _is_supported(seen):
-        return Round(before, screened, tuple(verdicts), False, RoundEvidence((seen,), {}, ()))
-    verdicts = _simplest_first(held, verdicts, screened, before, choices)
-    winner, added = verdicts[0], verdicts[0].trial.beyond(before)
-    removed, earlier = before.mean_square - winner.trial.mean_square, base.mean_square - before.mean_square
+    accepted = bool(verdicts) and _is_supported(asked[0])
+    if accepted:
+        verdicts = _simplest_first(held, verdicts, screened, before, choices)
+        winner, share = verdicts[0], _share_of_removed(held, verdicts[0].trial, before, base)
+        asked = [_evidence(winner.trial.beyond(before), winner.gain, winner.p_value, share)]
+        accepted = _is_supported(asked[0])
+    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(tuple(asked), {}, ()))
+
+
+def _refit(held: Held, before: TwistTrial, lead: Lead, screened: Screen[Lead]) -> TwistVerdict:
+    trial = held.beside(before, lead.terms)
+    gain = trial.gain_over(before)
+    # The null distribution is that of the grid of shapes; further gain by the search between grid points is not
+    # counted.
+    p_value = screened.p_value(min(gain, lead.gain))
+    name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
+    return Verdict(name, family, trial, gain, p_value, True)
+
+
+def _share_of_removed(held: Held, trial: TwistTrial, before: TwistTrial, base: TwistTrial) -> float:
+    """Error that a form removes, over the error that preceding ones have removed (rms)."""
+    removed, earlier = before.mean_square - trial.mean_square, base.mean_square - before.mean_square
     # A form that depends on the torque must also remove more than the torque's error may cause.
-    if any(form.of_torque for form in added) and removed <= torque_error(held.points, base):
+    if any(form.of_torque for form in trial.beyond(before)) and removed <= torque_error(held.points, base):
         removed = 0.0
-    share = math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf if removed > 0 else 0.0
-    seen = _evidence(added, winner.gain, winner.p_value, share)
-    return Round(before, screened, tuple(verdicts), _is_supported(seen), RoundEvidence((seen,), {}, ()))
+    return math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf if removed > 0 else 0.0
 
 
 def _evidence(forms: Sequence[Form], gain: float, p_value: float, removed: float = math.inf) -> EffectEvidence:
@@ -199,11 +209,11 @@ def _simplest_first(
     def is_tied(verdict: TwistVerdict) -> bool:
         if verdict.p_value > RULES.significance or held.is_worse(verdict.trial, leader.trial):
             return False
-        both = held.beside(verdict.trial, leader.trial.model.terms)
+        both = held.beside(verdict.trial, tuple(t for t in leader.trial.model.terms if t[0] in forms[leader.name]))
         return screened.p_value(both.gain_over(verdict.trial)) > RULES.significance
 
     def size(verdict: TwistVerdict) -> int:
-        return sum(form.size for form in forms[verdict.name])
+        return sum(form.size for form in verdict.trial.model.forms)
 
     able = [v for v in verdicts if v.p_value <= RULES.significance and v.gain >= _PLAUSIBLE * verdicts[0].gain]
     leader = next((v for v in able if _is_possible(v.trial.model)), verdicts[0])

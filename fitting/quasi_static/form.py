@@ -35,6 +35,7 @@ class Form:
         range: Least and largest value of each shape parameter, (2, shape parameters).
         sign: Physical sign of the first strength; zero for either.
         of_torque: Whether its regressors depend on the torque, so that a torque error may imitate it.
+        includes: Name of the form that it is a generalisation of, and that it replaces in an equation.
     """
 
     family: str
@@ -48,6 +49,7 @@ class Form:
     range: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
     sign: int = 0
     of_torque: bool = True
+    includes: str = ""
 
     @property
     def size(self) -> int:

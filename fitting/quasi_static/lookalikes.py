@@ -57,6 +57,15 @@ _AT_REST = {
         ),
     )
 }
+_SHIFTED = {
+    "kinematic_error": (
+        (
+            "position_dependent_stiffness",
+            "Repeat the run at a larger torque: the phase of a kinematic error between motor and load shifts in "
+            "proportion, at the same amplitude; a stiffness ripple beside one at the motor adds to the amplitude.",
+        ),
+    )
+}
 _ON_POSITION = {
     "stiffness_shape": (
         (
@@ -68,18 +77,20 @@ _ON_POSITION = {
 }
 
 
-def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> list[tuple[str, str]]:
+def lookalikes(family: str, points: Points, *, at_rest: bool = False, shifted: bool = False) -> list[tuple[str, str]]:
     """Families with the same regressors as a found one on these logs, each with the separating experiment.
 
     Args:
         family: Of the found effect.
         points: Of the logs.
         at_rest: Whether it was found at rest.
+        shifted: Whether the phase of a kinematic error shifts with the torque.
     """
     told = (
         (True, _ALWAYS),
         ("both ways" not in points.motion, _ONE_WAY),
         (at_rest, _AT_REST),
+        (shifted, _SHIFTED),
         (points.direction is not None and _hangs_on_position(points), _ON_POSITION),
     )
     return [pair for holds, alike in told if holds for pair in alike.get(family, ())]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from fitting.attribution.case_evidence import FinalEvidence
 from fitting.attribution.decisions import Check, Outcome, conclude, support
 from fitting.attribution.rules import RULES
-from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, is_determined, look
+from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, is_determined, look, torque_error
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
 from fitting.quasi_static.motion_forms import motion_forms
@@ -124,7 +124,7 @@ def close_loop(
             current = held.beside(current, at_rest.terms)
             progress(f"found {at_rest.terms[0][0].name}")
     left = leftover(held, current, base, seed)
-    decision, final_checks = _decide(base, current, left, points.twist_noise)
+    decision, final_checks = _decide(points, base, current, left)
     looks = rounds if at_rest is None else (*rounds, at_rest.round)
     asked = (check for this in looks for seen in this.evidence.asked for check in support(seen))
     return QuasiStaticLoop(
@@ -145,11 +145,13 @@ def close_loop(
 def _still_open(forms: tuple[Form, ...], current: TwistTrial, max_effects: int) -> list[tuple[Form, ...]]:
     """Forms that may be added: new families up to the limit, and further forms of accepted ones."""
     present = [form.family for form in current.model.forms]
+    included = {form.includes for form in current.model.forms}
     free = max_effects - len(set(present))
     left = [
         form
         for form in forms
         if form not in current.model.forms
+        and form.name not in included
         and (form.family in present or free > 0)
         and present.count(form.family) < _MOST_OF_A_FAMILY
     ]
@@ -204,10 +206,12 @@ def _findings(
 
 
 def _decide(
-    base: TwistTrial, after: TwistTrial, left: Leftover | None, noise: float
+    points: Points, base: TwistTrial, after: TwistTrial, left: Leftover | None
 ) -> tuple[Outcome, tuple[Check, ...]]:
-    """Decide; a residual is unexplained if it depends on a logged quantity, or is too large for coloured noise."""
-    names = tuple(form.name for form in after.model.forms)
-    explained = left is None and (bool(names) or base.rmse <= RULES.wander * noise)
+    """Decide; a residual is unexplained if it depends on a logged quantity, or is too large for the torque's error and
+    coloured noise."""
+    names, noise = tuple(form.name for form in after.model.forms), points.twist_noise
+    most = (RULES.wander * noise) ** 2 + torque_error(points, base)
+    explained = left is None and (bool(names) or base.mean_square <= most)
     seen = FinalEvidence(names, False, (after.rmse / noise,), (base.rmse / noise,), noise_explains=explained)
     return conclude(seen, replace(RULES, explained=RULES.quasi_static_explained))

@@ -151,7 +151,9 @@ def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
     """Effects that the equation can't distinguish from a found one, then those that were refitted in its place."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for one in loop.findings:
-        for family, experiment in lookalikes(one.family, loop.held.points, at_rest=one.at_rest is not None):
+        shifted = any(form.includes for form in one.forms)
+        alike = lookalikes(one.family, loop.held.points, at_rest=one.at_rest is not None, shifted=shifted)
+        for family, experiment in alike:
             if family == "coulomb_friction" and _slides_late(loop, one):
                 continue
             name = f"{family.replace('_', ' ')} instead of {one.family.replace('_', ' ')}"
@@ -175,10 +177,14 @@ def _slides_late(loop: QuasiStaticLoop, finding: Finding) -> bool:
 
 
 def _is_reported(rival: TwistVerdict, this: TwistRound) -> bool:
-    """Whether a candidate is a single form, and of another family than the winner or tied with it."""
+    """Whether a candidate is a single form, and of another family than the winner or tied with it.
+
+    A tied generalisation of the winner is the same effect.
+    """
     forms, taken = (verdict.trial.beyond(this.before) for verdict in (rival, this.winner))
     same = forms[0].family in {form.family for form in taken}
-    return len(forms) == 1 and not (same and rival.separable)
+    general = forms[0].includes in {form.name for form in taken}
+    return len(forms) == 1 and not (same and (rival.separable or general))
 
 
 def _alternative(
@@ -287,8 +293,8 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
         ),
         (
             not parts.tests,
-            "The logs are too short to set test data aside: no error on unused data is stated. Name "
-            "another log with --test.",
+            "The logs are too short to set test data aside, or their ends are at rest: no error on unused data is "
+            "stated. Name another log with --test.",
         ),
         beyond_fitted(unseen, points.torque, points.torque_error),
         few_stretches(int(stretches(model.misfit, points.log, each=2)[-1]) + 1),

@@ -1,4 +1,9 @@
-"""Effects of a moving joint: ripples in an angle, and friction on the motor's side."""
+"""Effects of a moving joint: ripples in an angle, and friction on the motor's side.
+
+A kinematic error is a function of the angle where it arises. With the motor's angle theta_m on one side and N theta_l
+on the other, that is theta_m - s N tau/K, where s is the share of the twist between motor and error. To first order, s
+adds n s N A tau/K sin(n theta_m + psi) to A cos(n theta_m + psi): the regressor of a stiffness ripple.
+"""
 
 import math
 from collections.abc import Iterator
@@ -9,10 +14,13 @@ import numpy as np
 from fitting.quasi_static.form import REST, Form
 from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
+from fitting.quasi_static.twist_model import fit_twist
 
 HIGHEST_ORDER = 12
 # Least number of points per period of an order.
 _POINTS_IN_PERIOD = 6
+# Starting values of the share of the twist between motor and kinematic error.
+_SHARES = (0.5, 1.0)
 
 
 def motion_forms(points: Points) -> Iterator[Form]:
@@ -37,18 +45,26 @@ def orders_seen(angle: np.ndarray | None, points: Points, highest: int) -> list[
 
 
 def _of_the_motor_angle(points: Points) -> Iterator[Form]:
+    if points.motor_angle is None:
+        return
+    # Motor angle per torque: the shift by the whole twist.
+    shift = (points.ratio or 0.0) * float(fit_twist(points).coefficients[0])
+    # Where twist alone turns the motor, its share would be a change of the order.
+    behind = orders_seen(_shifted(shift, points), points, HIGHEST_ORDER) if shift > 0.0 else []
     for n in orders_seen(points.motor_angle, points, HIGHEST_ORDER):
         waves, names = partial(_waves, "motor_angle", n), (f"cosine {n}", f"sine {n}")
         wave = f"a cos({n} theta_m) + b sin({n} theta_m)"
         yield Form(
             "kinematic_error",
-            f"order {n} of the motor",
+            _at_the_motor(n),
             partial(waves, None),
             names,
             f"twist = tau/K + {wave}",
             _of_a_wave(n, "kinematic error"),
             of_torque=False,
         )
+        if n in behind:
+            yield _behind_the_motor(n, shift, points)
         yield Form(
             "position_dependent_stiffness",
             f"stiffness ripple of order {n}",
@@ -71,6 +87,46 @@ def _of_the_motor_angle(points: Points) -> Iterator[Form]:
             )
 
 
+def _behind_the_motor(order: int, shift: float, points: Points) -> Form:
+    """A kinematic error with a part of the twist between it and the motor."""
+    assert points.ratio is not None
+    share = partial(_share_of_twist, points.ratio)
+    return Form(
+        "kinematic_error",
+        f"order {order} between motor and load",
+        partial(_shifted_waves, order),
+        (f"cosine {order}", f"sine {order}"),
+        f"twist = tau/K + a cos({order} phi) + b sin({order} phi), where phi = theta_m - s N tau/K",
+        (
+            *_of_a_wave(order, "kinematic error"),
+            Figure(f"share_of_twist_{order}", share, "1", "share s of the twist between motor and kinematic error"),
+        ),
+        shift * np.array(_SHARES)[:, None],
+        ("shift",),
+        np.array([[0.0], [shift]]),
+        of_torque=False,
+        includes=_at_the_motor(order),
+    )
+
+
+def _at_the_motor(order: int) -> str:
+    return f"order {order} of the motor"
+
+
+def _shifted(shift: float, points: Points) -> np.ndarray:
+    """The motor's angle less a shift per torque [rad], (n,)."""
+    assert points.motor_angle is not None
+    return points.motor_angle - shift * (points.torque - points.centre)
+
+
+def _shifted_waves(order: int, points: Points, shape: np.ndarray) -> np.ndarray:
+    return _turning(order * _shifted(shape[0], points))
+
+
+def _share_of_twist(ratio: float, own: np.ndarray) -> float:
+    return own[3] / (ratio * own[0])
+
+
 def _eccentricity(points: Points) -> Iterator[Form]:
     for n in orders_seen(points.load_angle, points, 2):
         yield Form(
@@ -85,8 +141,11 @@ def _eccentricity(points: Points) -> Iterator[Form]:
 
 
 def _waves(angle: str, order: int, factor: str | None, points: Points, shape: np.ndarray) -> np.ndarray:
-    phase = order * getattr(points, angle)[:, None]
-    return np.hstack([np.cos(phase), np.sin(phase)]) * (1.0 if factor is None else getattr(points, factor)[:, None])
+    return _turning(order * getattr(points, angle)) * (1.0 if factor is None else getattr(points, factor)[:, None])
+
+
+def _turning(phase: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.cos(phase), np.sin(phase)])
 
 
 def _amplitude(own: np.ndarray) -> float:

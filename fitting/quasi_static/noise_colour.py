@@ -7,12 +7,15 @@ import numpy as np
 from scipy.fft import prev_fast_len
 from scipy.signal import lfilter
 
-from fitting.first_order.spectral_lines import without_lines
+from fitting.first_order.spectral_lines import STANDS_OUT, off_the_grid, surroundings, without_lines
 
 DRAWS = 999
 """Number of surrogates: enough to determine a p-value of 0.01 accurately."""
 
 _HIGHEST_ORDER = 30
+_MOST_LINES = 20
+# Frequencies on each side with which a line is compared; below as many, slow noise may look like a line.
+_NEIGHBOURS = 20
 # Length of the discarded start-up of the process, over its largest order.
 _WARM_UP = 2000
 
@@ -27,10 +30,32 @@ def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) 
         random: Generator.
     """
     length = prev_fast_len(len(residual), real=True)
-    series = np.fft.irfft(without_lines(np.fft.rfft((residual - np.mean(residual))[:length])), n=length)
+    series = _less_sinusoids((residual - np.mean(residual))[:length])
+    series = np.fft.irfft(without_lines(np.fft.rfft(series)), n=length)
     coefficients, variance = autoregression(series)
     innovations = random.normal(size=(DRAWS, _WARM_UP + len(residual))) * np.sqrt(variance)
     return np.asarray(lfilter([1.0], coefficients, innovations, axis=1))[:, _WARM_UP:]
+
+
+def _less_sinusoids(series: np.ndarray) -> np.ndarray:
+    """A series less the sinusoids of its significant lines, (n,).
+
+    They are found under a window: without one, a line between grid frequencies leaks and would count as noise around
+    it.
+    """
+    count, waves, left = len(series), [], series
+    at, window = np.arange(count), np.hanning(count)
+    for _ in range(_MOST_LINES if count > 4 * _NEIGHBOURS else 0):
+        power = np.abs(np.fft.rfft(window * left, n=2 * count)) ** 2
+        ratio = power / surroundings(power, neighbours=_NEIGHBOURS)
+        peak = _NEIGHBOURS + int(np.argmax(ratio[_NEIGHBOURS:]))
+        if ratio[peak] < STANDS_OUT:
+            break
+        (place,) = peak + off_the_grid(power, np.array([peak]))
+        waves += [turn(np.pi * place / count * at) for turn in (np.cos, np.sin)]
+        matrix = np.column_stack(waves)
+        left = series - matrix @ np.linalg.lstsq(matrix, series, rcond=1e-9)[0]
+    return left
 
 
 def autoregression(series: np.ndarray) -> tuple[np.ndarray, float]:

@@ -49,6 +49,7 @@ class Points:
         twist_noise: Of a point's twist [rad].
         rows: Rows in a point, by log.
         reversals: Of the torque, by log.
+        ratio: Reduction ratio, or None.
         reference: Points that supply middle torque and mean temperature; these points where None.
     """
 
@@ -69,6 +70,7 @@ class Points:
     twist_noise: float
     rows: tuple[int, ...]
     reversals: tuple[int, ...]
+    ratio: float | None = None
     reference: "Points | None" = None
 
     @cached_property
@@ -146,6 +148,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
         rows=tuple(round(len(one) / size) for one, size in zip(logs, sizes, strict=True)),
         # Coarse enough for reversals to exceed the torque's noise.
         reversals=tuple(len(turns(torque_of(one), max(1, len(one) // 200))) for one in logs),
+        ratio=ratio,
     )
 
 
@@ -179,17 +182,18 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
         Stein 1981, Annals of Statistics 9(6), equation 2.5; Savitzky and Golay 1964, Analytical Chemistry 36(8).
     """
     variance = noise(values) ** 2
-    best, least = values, variance
+    best, least, error = values, variance, variance
     for width in _WIDTHS:
         if 10 * width > len(values):
             break
         smooth = np.asarray(savgol_filter(values, width, 3))
         own_share = float(savgol_coeffs(width, 3)[width // 2])
-        # The error is at least the variance of the local cubic.
-        risk = max(float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance)
+        risk = float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance
         if risk < least:
-            best, least = smooth, risk
-    return best, math.sqrt(least)
+            # The error is at least the variance of the local cubic. That must not choose the width: the risks of all
+            # widths share the error of the noise variance, and the floor is lowest for the widest one.
+            best, least, error = smooth, risk, max(risk, own_share * variance)
+    return best, math.sqrt(error)
 
 
 def _rests(at_rest: np.ndarray, log: np.ndarray) -> np.ndarray:

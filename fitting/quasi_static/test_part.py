@@ -19,7 +19,7 @@ from fitting.quasi_static.attribution import Held
 from fitting.quasi_static.facts import FEW_STRETCHES
 from fitting.quasi_static.form import START
 from fitting.quasi_static.points import Points, points_of
-from fitting.quasi_static.preparation import QuasiStaticData, believed, prepare
+from fitting.quasi_static.preparation import Motion, QuasiStaticData, believed, prepare
 from fitting.quasi_static.twist_model import TwistModel
 from fitting.quasi_static.unseen_logs import LEAD
 
@@ -61,7 +61,7 @@ class Parted:
     Attributes:
         data: Fitted data.
         points: Of these rows.
-        tests: By log; empty where the logs are too short to be divided.
+        tests: By log; empty where the logs are too short to be divided, or at rest at their ends.
     """
 
     data: QuasiStaticData
@@ -75,7 +75,8 @@ def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ())
     Args:
         logs: Of one drive.
         drive_file: Of the drive.
-        test: Logs of test data; without any, the end of each log is, unless too little would remain to select a model.
+        test: Logs of test data; without any, the end of each log is, unless too little would remain to select a model,
+            or all joints are at rest there.
 
     Raises:
         DataError: A log can't be fitted.
@@ -91,16 +92,18 @@ def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ())
     try:
         data = prepare([log.rows(0, _border(log)) for log in logs], drive_file, at_rest=True)
         points = points_of(data.logs, data.motion, ratio)
+        tests = tuple(_end(log, motion, ratio) for log, motion in zip(logs, data.motion, strict=True))
+        if _is_enough(points) and any(one.rows for one in tests):
+            return Parted(data, points, tests)
     except DataError:
-        points = None
-    if points is None or not _is_enough(points):
-        data = prepare(logs, drive_file, at_rest=True)
-        return Parted(data, points_of(data.logs, data.motion, ratio), ())
-    tests = tuple(
-        Unseen.of(points_of([believed(log)], [motion], ratio), float(log.time[_border(log)] - believed(log).time[0]))
-        for log, motion in zip(logs, data.motion, strict=True)
-    )
-    return Parted(data, points, tests)
+        pass
+    data = prepare(logs, drive_file, at_rest=True)
+    return Parted(data, points_of(data.logs, data.motion, ratio), ())
+
+
+def _end(log: Log, motion: Motion, ratio: float | None) -> Unseen:
+    known = believed(log)
+    return Unseen.of(points_of([known], [motion], ratio), float(log.time[_border(log)] - known.time[0]))
 
 
 def _is_enough(points: Points) -> bool:
@@ -114,14 +117,15 @@ def _border(log: Log) -> int:
 
 
 def misfit_on(tests: Sequence[Unseen], model: TwistModel, fitted: Points) -> np.ndarray | None:
-    """Measured less predicted twist of the test data [rad], (scored,); None where there are none.
+    """Measured less predicted twist of the test data [rad], (scored,); None where nothing is scored.
 
     Args:
         tests: By log.
         model: The equation.
         fitted: The fitted points.
     """
-    return np.concatenate([_misfit(one, model, fitted) for one in tests]) if tests else None
+    found = np.concatenate([np.zeros(0), *(_misfit(one, model, fitted) for one in tests)])
+    return found if found.size else None
 
 
 def _misfit(test: Unseen, model: TwistModel, fitted: Points) -> np.ndarray:

@@ -37,6 +37,7 @@ NO_EFFECT = [
     {"moves": "held"},
     {"moves": "held", "colour": 0.9, "twist_noise": 2e-5},
     {"moves": "held", "torque_noise": 3.0, "kind": "triangle", "cycles": 6.0},
+    {"moves": "held", "torque_noise": 1.0, "twist_noise": 1e-7, "cycles": 3.0},
     {"moves": "one way", "colour": 0.9},
     {"moves": "both ways", "colour": 0.9, "cycles": 5.0},
 ]
@@ -103,6 +104,27 @@ def test_ripple_amplitude_phase_and_stiffness_are_estimated() -> None:
     assert all(known[name].identifiable for name in known)
     # Smoothing reduces the torque's peaks by 1e-4.
     assert stiffness_of(loop.held.points, loop.after.model)["K"].value == pytest.approx(K, rel=1e-3)
+
+
+@pytest.mark.parametrize(("share", "order", "moves"), [(0.4, 1, "both ways"), (1.0, 2, "one way")])
+def test_kinematic_error_behind_a_share_of_the_twist_is_no_stiffness_ripple(
+    share: float, order: int, moves: str
+) -> None:
+    """Its phase shifts with the torque, which to first order is a stiffness that depends on the angle."""
+    loop = closed(slow_joint([slow_joints.ripple(1e-4, order, share=share)], moves=moves, cycles=1.6))
+    assert families(loop) == {"kinematic_error"} and len(loop.findings[0].forms) == 1
+    known = figures(loop, "kinematic_error")
+    assert known[f"amplitude_{order}"].value == pytest.approx(1e-4, rel=0.02)
+    estimate = known[f"share_of_twist_{order}"]
+    # Three standard errors, of 0.02 at most.
+    assert estimate.value == pytest.approx(share, abs=0.06) and estimate.identifiable
+
+
+def test_stiffness_ripple_beside_a_kinematic_error_is_identified() -> None:
+    effects = [slow_joints.ripple(1e-4, 2), slow_joints.soft_spots(0.03, 2)]
+    loop = closed(slow_joint(effects, moves="both ways", cycles=1.6))
+    assert families(loop) == {"kinematic_error", "position_dependent_stiffness"}
+    assert figures(loop, "position_dependent_stiffness")["amplitude_2"].value == pytest.approx(0.03, rel=0.1)
 
 
 def test_ripple_amplitude_interval_has_nominal_coverage() -> None:
@@ -216,12 +238,20 @@ def test_autoregression_and_its_draws_agree_with_the_noise_process() -> None:
     assert np.std(draws) == pytest.approx(np.std(series[1000:]), rel=0.1)
 
 
-@pytest.mark.parametrize("kind", ["sine", "triangle"])
-def test_stated_error_of_the_smoothed_torque_is_unbiased(kind: str) -> None:
+def test_lines_between_grid_frequencies_are_no_noise() -> None:
+    """Draws from the residual of two kinematic errors are no larger than the largest lines that noise may contain."""
+    random, at = np.random.default_rng(0), np.arange(1500)
+    noise = random.normal(size=len(at))
+    lines = 30.0 * (np.sin(2 * np.pi * 95.5 / 1500 * at) + np.sin(2 * np.pi * 191.4 / 1500 * at))
+    assert np.std(noise_of_the_same_colour(noise + lines, random)) < 2.0
+
+
+@pytest.mark.parametrize(("kind", "cycles"), [("sine", 5.0), ("triangle", 5.0), ("triangle", 2.0)])
+def test_stated_error_of_the_smoothed_torque_is_unbiased(kind: str, cycles: float) -> None:
     ratios = []
     for seed in range(30):
-        log, _ = slow_joint(kind=kind, torque_noise=2.0, cycles=5.0, seed=seed)
-        truth, _ = slow_joint(kind=kind, torque_noise=0.0, cycles=5.0, seed=seed)
+        log, _ = slow_joint(kind=kind, torque_noise=2.0, cycles=cycles, seed=seed)
+        truth, _ = slow_joint(kind=kind, torque_noise=0.0, cycles=cycles, seed=seed)
         assert log.joint_torque is not None and truth.joint_torque is not None
         smooth, error = without_noise(log.joint_torque)
         ratios.append(np.mean((smooth - truth.joint_torque) ** 2) / error**2)
@@ -229,6 +259,8 @@ def test_stated_error_of_the_smoothed_torque_is_unbiased(kind: str) -> None:
         assert error < 1.2
     # Stein's estimate is unbiased, apart from the choice of the least of several.
     assert 0.8 < np.mean(ratios) < 1.5
+    # An effect of the torque counts where it removes more than twice that mean square.
+    assert np.mean(np.array(ratios) > 2.0) < 0.1
 
 
 def test_lookalike_effects_depend_on_the_motion() -> None:

@@ -75,6 +75,13 @@ def test_short_log_has_no_error_on_test_data(drive_file: DriveFile):
     assert any("too short to set test data aside" in note for note in found["cannot_tell"])
 
 
+def test_log_that_ends_at_rest_is_fitted_whole(drive_file: DriveFile):
+    """Rests are not scored, since each has a level of its own."""
+    log, _ = slow_joint(moves="one way", cycles=5.0)
+    found = report(drive_file, log)
+    assert found["judged_on"] == "selection" and found["logs"][0]["samples"] == len(log)
+
+
 def test_extrapolation_to_larger_torques_is_reported(drive_file: DriveFile):
     small, _ = slow_joint(**LONG)
     large = replace(slow_joint(**LONG, largest=90.0)[0], name="large")
