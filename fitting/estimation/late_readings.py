@@ -89,5 +89,6 @@ def moved_readings(
     columns = dict(zip(names, outputs.T, strict=True))
     if "dynamic_error" in columns:
         turn = columns["motor_turn"]
-        columns["dynamic_error"] = turn - later(turn - columns["dynamic_error"])
+        if np.isfinite(outputs).all():
+            columns["dynamic_error"] = turn - later(turn - columns["dynamic_error"])
     return np.stack([later(v) if name in ("load_angle", "load_velocity") else v for name, v in columns.items()], axis=1)

@@ -97,6 +97,12 @@ class EncoderDelay(SensorEffect):
     )
     moved: Scalar = eqx.field(default=0.0, converter=as_scalar, kw_only=True)
 
+    @classmethod
+    def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
+        """A delay of whole rows between the sides: to first order in it, far too little of it may be seen."""
+        late = cls.side * scales.load_late
+        return (({}, cls(delay=late)),) if late > 0.0 else ()
+
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l
 
