@@ -29,7 +29,7 @@ def aligned(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, tuple[St
     """
     step = stretches[0].experiment.time_step
     effects = tuple(_moved(e, _whole_rows(e, step)) if isinstance(e, EncoderDelay) else e for e in model.effects)
-    by = sum(e.side * float(e.moved) for e in effects if isinstance(e, EncoderDelay))
+    by = float(sum(e.side * float(e.moved) for e in effects if isinstance(e, EncoderDelay)))
     if all(s.experiment.load_moved == by for s in stretches):
         return replace(model, effects=effects), tuple(stretches)
     done = {id(s.experiment): with_load_moved(s.experiment, by) for s in stretches}
