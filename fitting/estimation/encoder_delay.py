@@ -37,12 +37,12 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
         return 0.0
     step = stretches[0].experiment.time_step
     most = int(min(LONGEST_DELAY / step, _MOST_ROWS))
-    rows = np.arange(-most, most + 1)
+    rows = range(-most, most + 1)
     parts = [_signals(stretch) for stretch in stretches]
     left = [[_unexplained(model, parts, width, step, row, most) for row in rows] for width in WIDTHS]
     best = min(left, key=min)
     row = int(np.argmin(best))
-    return float(rows[row]) * step if best[row] < _LEFT**2 * best[most] else 0.0
+    return rows[row] * step if best[row] < _LEFT**2 * best[most] else 0.0
 
 
 def _signals(stretch: Stretch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -59,7 +59,7 @@ def _unexplained(
 ) -> float:
     """Unexplained share of the load's mean square acceleration, if its readings are `row` rows late."""
     tests, slopes, curvatures = blind_functions(width, step)
-    rows = []
+    rows, hop = [], max(1, width // 4)
     for turn, angle, T_l in parts:
         inner = slice(most, turn.size - most)
         if turn.size < 2 * most + 3 * width:
@@ -67,8 +67,7 @@ def _unexplained(
         load, x = np.roll(angle, -row)[inner], (turn - np.roll(angle, -row))[inner]
         terms = [(x, tests), (x**3, tests), (x, slopes), (load, slopes), (np.sign(np.gradient(load)), tests)]
         right = [(float(model.drive.J_l) * load, curvatures), (-T_l[inner], tests)]
-        hop = max(1, width // 4)
-        columns = [weak_form.against(*pair, hop) for pair in (*terms, *right)]
+        columns = [weak_form.against(signal, functions, hop) for signal, functions in (*terms, *right)]
         rows.append(np.stack([*columns[:5], columns[5] + columns[6]], axis=1))
     if not rows:
         return 1.0

@@ -13,7 +13,8 @@ from scipy.interpolate import CubicSpline
 from fitting.estimation.experiment import Experiment, Stretch
 from hdjax import Model
 from hdjax.dynamics import BOTH_ANGLES
-from hdjax.effects import Effect, EncoderDelay
+from hdjax.effects import Effect
+from hdjax.effects.sensing import EncoderDelay
 from hdjax.parameters import as_scalar, own_parameters
 
 # Rows beyond which the law's part of a delay is too long; above a half, so that a delay of half a row settles.

@@ -43,13 +43,7 @@ from hdjax.effects.position import (
 )
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
-from hdjax.effects.sensing import (
-    EncoderDelay,
-    LoadEncoderDelay,
-    LoadEncoderEccentricity,
-    MotorEncoderDelay,
-    MotorEncoderEccentricity,
-)
+from hdjax.effects.sensing import LoadEncoderDelay, LoadEncoderEccentricity, MotorEncoderDelay, MotorEncoderEccentricity
 from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
@@ -73,7 +67,6 @@ __all__ = [
     "DisplacementDamping",
     "DryFriction",
     "Effect",
-    "EncoderDelay",
     "ExtraResonance",
     "FAMILIES",
     "GravityLoad",
