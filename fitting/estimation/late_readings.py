@@ -82,6 +82,8 @@ def moved_readings(
 ) -> Float[np.ndarray, "n outputs"]:
     """Outputs with the load's from a later time. At equal sample intervals, whole rows are moved; others are
     interpolated. Those beyond the ends are held."""
+    if by == 0.0:
+        return outputs
     at = np.clip(time + by, time[0], time[-1])
 
     def later(values: np.ndarray) -> np.ndarray:

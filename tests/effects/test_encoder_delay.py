@@ -35,8 +35,9 @@ def log_with_late_encoder(side: int, steps: int) -> Stretch:
     return Stretch(experiment_from_log(log, hold="zero-order", N=rig.N), 0, COUNT)
 
 
-@pytest.mark.parametrize("steps", [4, 17])
-@pytest.mark.parametrize("form, side", [(MotorEncoderDelay, 0), (LoadEncoderDelay, 1)])
+@pytest.mark.parametrize(
+    "form, side, steps", [(MotorEncoderDelay, 0, 17), (LoadEncoderDelay, 1, 4), (LoadEncoderDelay, 1, 17)]
+)
 def test_encoder_delay_is_estimated_from_a_log(form: type[EncoderDelay], side: int, steps: int):
     """A delay within a row, and one of several rows, a tenth of a natural period."""
     stretch = log_with_late_encoder(side, steps)
