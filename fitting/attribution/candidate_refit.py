@@ -10,7 +10,6 @@ from fitting.attribution.rules import RULES
 from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, Strategy
-from fitting.estimation.scales import scales
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
@@ -42,7 +41,7 @@ def begin(before: Trial, lead: Lead, study: Study) -> Fit:
         new = float(value) + change
         # First-order changes may overshoot; a positive parameter stays positive.
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
-    swing = scales(before.training.stretches, model)
+    swing = study.scales(before.training.stretches, model)
     starts = [
         _with_form(model.replace(moved), _with_positive_strengths(lead.effect)),
         *(_with_form(model, effect) for effect in lead.effect.typical(swing)),

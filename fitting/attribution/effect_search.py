@@ -13,6 +13,7 @@ from fitting.attribution.study import Data, Setting, Study
 from fitting.attribution.support import Standing, leaves_imperfection
 from fitting.errors import DataError
 from fitting.estimation.base_fit import base_fit, is_held
+from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import lost
 from fitting.estimation.outliers import with_weights
 from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
@@ -56,7 +57,7 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Stud
     training = data[first][0]
     best = base_fit(model, training, halo=halo_for(training))
     data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
-    study = Study(data, Setting(best.segmentation))
+    study = Study(data, Setting(best.segmentation), load_late=delay_of_load(model, training))
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, study, h, hold_parameters=is_held(best)) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)

@@ -25,7 +25,6 @@ from fitting.attribution.support import (
     strength_errors,
 )
 from fitting.estimation.base_fit import leaves_white_noise
-from fitting.estimation.scales import scales
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 
@@ -154,7 +153,7 @@ class _Refits:
         """Refit the most likely form of each family, and further forms near the best one."""
         before = self.before
         worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
-        swing = scales(before.training.stretches, before.model)
+        swing = self.study.scales(before.training.stretches, before.model)
         behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
         suspects = [lead for lead in behind if lead not in worth]
         first = first_of_each_family(worth, suspects)

@@ -1,5 +1,6 @@
 """Data and settings of a loop: training and selection data, segmentation, seed of the surrogates, progress."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -8,9 +9,11 @@ from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation
+from fitting.estimation.scales import scales
 from fitting.estimation.solver_steps import needed_substeps
 from fitting.progress import Progress, silent
-from hdjax import Hold
+from hdjax import Hold, Model
+from hdjax.effects import Scales
 
 # Least decrease of the objective, times two, over a few steps for an iteration to go on; the second one applies while
 # several candidates compete.
@@ -48,12 +51,18 @@ class Study:
         setting: segmentation and iteration.
         seed: of the surrogates for p-values.
         progress: receives messages.
+        load_late: see [`hdjax.effects.Scales`][].
     """
 
     data: Data
     setting: Setting
     seed: int = 0
     progress: Progress = silent
+    load_late: float = 0.0
+
+    def scales(self, stretches: Sequence[Stretch], model: Model) -> Scales:
+        """Orders of magnitude of a motion, see [`fitting.estimation.scales.scales`][]."""
+        return replace(scales(stretches, model), load_late=self.load_late)
 
     def with_substeps(self, count: int) -> "Study":
         """The same with a given number of solver steps per sample interval."""

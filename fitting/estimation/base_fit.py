@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.estimation.beside_friction import fits_of_starts, held_beside, refitted_beside
+from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
+from fitting.estimation.late_readings import with_load_moved
 from fitting.estimation.motor_driven import held_at, motor_driven_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
@@ -90,7 +92,22 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
 
 
 def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
-    """The fit over short horizons where the dynamic error was measured, and its starting model."""
+    """The fit over short horizons where the dynamic error was measured, and its starting model.
+
+    Encoders that are read rows apart leave no minimum near the true parameters. They are fixed at those of the fit
+    without these rows.
+    """
+    late = delay_of_load(model, training)
+    if not late:
+        return _fit_of_both_angles(model, training, halo)
+    # Taken as logged like this, or a fit without an encoder's delay would move the readings back.
+    moved = [replace(s, experiment=replace(with_load_moved(s.experiment, late), load_moved=0.0)) for s in training]
+    best, start = _fit_of_both_angles(model, moved, halo)
+    return _held_at(best, best.model, training, halo), start
+
+
+def _fit_of_both_angles(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
+    """[`_fit_of_twist`][] of encoders that are read together."""
     priors = ()
     if isinstance(model, TwoInertiaModel):
         # Free inertias would absorb what the base model lacks before the load's equation is used.

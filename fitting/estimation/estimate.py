@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters
+from fitting.estimation.late_readings import aligned, is_aligned
 from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
 from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
@@ -27,6 +28,8 @@ _MOST_REWEIGHTINGS = 12
 _LONGEST_RETRY = 16
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
+# Most moves of a late encoder's readings: the law's error in a long delay is less after each.
+_MOST_MOVES = 4
 # Iterations in each of the growing windows of samples.
 _WINDOW_STEPS = 12
 
@@ -162,7 +165,7 @@ def fit(
     Long horizons are cut into joined segments that are simulated in parallel. Their gaps close as the fit converges, so
     that the result equals that of one simulation (multiple shooting). The outputs are weighted by the residual's
     covariance, which maximises the likelihood of Gaussian errors of unknown covariance. An output that the model can't
-    follow is down-weighted.
+    follow is down-weighted. Readings of a late encoder are moved by the whole rows of the fitted delay.
 
     Args:
         model: equations and starting values.
@@ -176,6 +179,26 @@ def fit(
     Returns:
         The fit.
     """
+    found = _fit_aligned(*aligned(model, stretches), paths, segmentation, start, strategy, engine)
+    for _ in range(_MOST_MOVES):
+        if is_aligned(found.model, found.stretches):
+            break
+        start = Start(found.covariance, found.unknowns.states)
+        data = aligned(found.model, found.stretches)
+        found = _fit_aligned(*data, paths, segmentation, start, strategy, engine)
+    return found
+
+
+def _fit_aligned(
+    model: Model,
+    stretches: Sequence[Stretch],
+    paths: Sequence[str],
+    segmentation: Segmentation,
+    start: Start,
+    strategy: Strategy,
+    engine: Engine | None,
+) -> Fit:
+    """[`fit`][] of data whose readings are moved for the model's delays."""
     problem, unknowns = pose(
         model,
         stretches,

@@ -39,6 +39,8 @@ class Experiment(eqx.Module):
         log: the name of the log that it is a part of.
         rate_std: relative standard deviation of the sample interval, from the rounding of the log's stamps.
         outputs: names of the measured outputs, see `hdjax.dynamics.OUTPUTS`.
+        load_moved: time by which the load's readings are from later rows [s], see
+            [`fitting.estimation.late_readings`][].
     """
 
     name: str = eqx.field(static=True)
@@ -54,6 +56,7 @@ class Experiment(eqx.Module):
     log: str = eqx.field(static=True, default="")
     rate_std: float = eqx.field(static=True, default=0.0)
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
+    load_moved: float = eqx.field(static=True, default=0.0)
 
     def __len__(self) -> int:
         return self.time.size

@@ -1,6 +1,7 @@
 """Free runs: simulations from an initial state that is fitted to a short window."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters, free_parameters
+from fitting.estimation.late_readings import aligned, moved_readings, with_load_moved
 from fitting.estimation.problem import Segmentation, suggested_substeps
 from fitting.estimation.reach import Condition, Quantity, Range, ranges, reach
 from fitting.estimation.residual import Problem, Unknowns
@@ -129,17 +131,20 @@ def free_run(
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
+    logged = [replace(s, experiment=with_load_moved(s.experiment, 0.0)) for s in stretches]
+    model, stretches = aligned(model, stretches)
     starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))
     problem = whole_simulations(model, free_parameters(model, (), {}), stretches, halo, substeps)
     outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
     runs = []
-    for stretch, output in zip(stretches, outputs, strict=True):
-        n = len(stretch)
+    late = stretches[0].experiment.load_moved
+    for stretch, output in zip(logged, outputs, strict=True):
         part = slice(stretch.start, stretch.stop)
-        measured = stretch.experiment.measured[part]
+        time, measured = stretch.experiment.time[part], stretch.experiment.measured[part]
+        simulated = moved_readings(time, output[: len(stretch)], model.measured, -late)
         pairs = {
-            told: (factor * output[:n, k], factor * measured[:, k])
+            told: (factor * simulated[:, k], factor * measured[:, k])
             for k, (told, factor) in enumerate(zip(*as_logged(model), strict=True))
         }
         principal = list(pairs)[-1]
@@ -147,17 +152,22 @@ def free_run(
         runs.append(
             FreeRun(
                 name=stretch.name,
-                time=stretch.experiment.time[part],
+                time=time,
                 predicted=predicted,
                 measured=seen,
                 beside=pairs,
-                weight=stretch.weight,
+                weight=stretch.weight * _within(time, time - late),
                 output=principal,
                 reach=reach(stretch, model),
                 ranges=ranges(stretch, model),
             )
         )
     return tuple(runs)
+
+
+def _within(time: Float[np.ndarray, " n"], at: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Which times are within those of a stretch."""
+    return (time[0] <= at) & (at <= time[-1])
 
 
 def as_logged(model: Model) -> tuple[tuple[str, ...], tuple[float, ...]]:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import FreeParameters, free_parameters
+from fitting.estimation.late_readings import unaligned
 from fitting.estimation.weighing import whitening
 from fitting.next_experiment.excitation import Excitation, Limits
 from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
@@ -60,7 +61,7 @@ def explanation(
 ) -> Explanation:
     """An explanation with free parameters at `paths`; `scale` as in
     [`fitting.estimation.free_parameters.free_parameters`][]."""
-    return Explanation(name, model, free_parameters(model, paths, scale or {}), hold)
+    return Explanation(name, unaligned(model), free_parameters(model, paths, scale or {}), hold)
 
 
 class Bench(eqx.Module):

@@ -329,12 +329,13 @@ def _on_logs(
             return None
         # The other model may have another hold of the torque.
         logs = zip(of_other.trial.training.stretches, simulated, strict=True)
-        ratios.append(judge.ratio(other, [_with_measured(s, made.experiment.measured) for s, made in logs]))
+        ratios.append(judge.ratio(other, [_with_measured(s, made.experiment) for s, made in logs]))
     return ratios[0], ratios[1]
 
 
-def _with_measured(stretch: Stretch, measured: Float[np.ndarray, "samples outputs"]) -> Stretch:
-    return replace(stretch, experiment=replace(stretch.experiment, measured=measured))
+def _with_measured(stretch: Stretch, made: Experiment) -> Stretch:
+    own = {"measured": made.measured, "weight": made.weight, "load_moved": made.load_moved}
+    return replace(stretch, experiment=replace(stretch.experiment, **own))
 
 
 def _on_proposal(

@@ -10,6 +10,7 @@ from fitting.estimation.engines import why_not
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_run import FreeRun, free_run, rms_error
+from fitting.estimation.late_readings import unaligned
 from fitting.uncertainty.identifiability import Identifiability, identifiability
 from fitting.uncertainty.profile_likelihood import with_profiles
 from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
@@ -92,7 +93,7 @@ def account(
     told = identifiability(judged, found)
     if std_from is not None:
         found = found.in_units_of(fit, std_from)
-    return Account(fit.model, found, seen, selection, unseen, told, why_not(fit.problem))
+    return Account(unaligned(fit.model), found, seen, selection, unseen, told, why_not(fit.problem))
 
 
 def free_runs(

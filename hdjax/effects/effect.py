@@ -88,6 +88,7 @@ class Scales(eqx.Module):
         temperature: mean temperature of the first log [K], or None where a log has no such channel.
         temperature_change: rms distance from it over all logs [K].
         residual_frequencies: strongest lines of the current model's residual [rad/s], strongest first.
+        load_late: time by which the load's sensors seem to be read later than the motor's, in whole rows [s].
     """
 
     x: float
@@ -102,6 +103,7 @@ class Scales(eqx.Module):
     temperature: float | None = None
     temperature_change: float = 0.0
     residual_frequencies: tuple[float, ...] = ()
+    load_late: float = 0.0
 
     @property
     def natural_frequency(self) -> float:

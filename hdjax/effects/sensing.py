@@ -2,12 +2,13 @@
 
 from typing import ClassVar
 
+import equinox as eqx
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import ActuatorEffect, Effect, Scales, SensorEffect
 from hdjax.effects.ripple import amplitude_and_phase, ripple
-from hdjax.parameters import Scalar, parameter
+from hdjax.parameters import Scalar, as_scalar, parameter
 from hdjax.signals import PiecewisePolynomial
 
 SOURCE = "EFFECTS: 10 um on a disc of 25 to 50 mm are 40 to 80 arcsec"
@@ -72,13 +73,18 @@ class LoadEncoderEccentricity(SensorEffect):
         return amplitude_and_phase(self.cosine, self.sine, "rad")
 
 
-class _EncoderDelay(SensorEffect):
+class EncoderDelay(SensorEffect):
     """One side's sensors are read later than the other's, by a filter or their way over a bus.
 
     What both are late by is an `input_delay`.
+
+    Attributes:
+        side: 1 where the load's sensors are late, -1 where the motor's are.
+        moved: the part of the delay by which a log's readings have been moved already [s]; the law spans the rest.
     """
 
     family: ClassVar[str] = "sensor_delay"
+    side: ClassVar[float]
 
     delay: Scalar = parameter(
         0.0,
@@ -89,18 +95,29 @@ class _EncoderDelay(SensorEffect):
         plausible=(1e-5, 1e-3),
         role="strength",
     )
+    moved: Scalar = eqx.field(default=0.0, converter=as_scalar, kw_only=True)
+
+    @classmethod
+    def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
+        """A delay of whole rows between the sides: to first order in it, far too little of it may be seen."""
+        late = cls.side * scales.load_late
+        return (({}, cls(delay=late)),) if late > 0.0 else ()
 
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l
 
+    def load_delay(self) -> Array:
+        return self.side * (self.delay - self.moved)
 
-class MotorEncoderDelay(_EncoderDelay, ActuatorEffect):
+
+class MotorEncoderDelay(EncoderDelay, ActuatorEffect):
     """The motor's sensors read `theta_m(t - delay)`.
 
     The simulation's time is that of the motor's reading: the torque is as late, and the load is read ahead.
     """
 
     name: ClassVar[str] = "motor_encoder_delay"
+    side: ClassVar[float] = -1.0
     takes_numpy: ClassVar[bool] = True
 
     @classmethod
@@ -111,18 +128,13 @@ class MotorEncoderDelay(_EncoderDelay, ActuatorEffect):
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.delayed(self.delay)
 
-    def load_delay(self) -> Array:
-        return -self.delay
 
-
-class LoadEncoderDelay(_EncoderDelay):
+class LoadEncoderDelay(EncoderDelay):
     """The load's sensors read `theta_l(t - delay)`."""
 
     name: ClassVar[str] = "load_encoder_delay"
+    side: ClassVar[float] = 1.0
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return (cls(),)
-
-    def load_delay(self) -> Array:
-        return self.delay

@@ -1,0 +1,77 @@
+"""Delay between the encoders, in whole rows, by the load's equation of motion in weak form.
+
+    J_l theta_l'' = K f(x) + B_sp x' + T_l - friction of the load,    x = theta_m/N - theta_l
+
+is linear in the unknowns for a given delay. It holds whatever acts on the motor. A wrong delay leaves much of it
+unexplained: near the resonance the load does not follow the motor, so that nothing else shifts their phase alike.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fitting.estimation import weak_form
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.starting_values import sees_twist
+from fitting.estimation.weak_form import WIDTHS, blind_functions
+from hdjax import Model, TwoInertiaModel
+
+LONGEST_DELAY = 1e-2
+"""Longest delay that is looked for [s]; assumed, several cycles of a bus."""
+
+# A delay must leave less than this share of the rms error without one, assumed: as for other causes of a wrong minimum.
+_LEFT = 0.5
+# Most rows of a delay, and of a stretch, that are looked at: more take longer and tell little.
+_MOST_ROWS, _ENOUGH = 64, 4000
+
+
+def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
+    """Whole rows by which the load's readings are later than the motor's [s], negative where they are earlier. Zero
+    where no delay explains the load's motion far better, or the twist was not measured.
+
+    Args:
+        model: supplies the load's inertia.
+        stretches: the data.
+    """
+    if not isinstance(model, TwoInertiaModel) or not sees_twist(stretches):
+        return 0.0
+    step = stretches[0].experiment.time_step
+    most = int(min(LONGEST_DELAY / step, _MOST_ROWS))
+    rows = range(-most, most + 1)
+    parts = [_signals(stretch) for stretch in stretches]
+    left = [[_unexplained(model, parts, width, step, row, most) for row in rows] for width in WIDTHS]
+    best = min(left, key=min)
+    row = int(np.argmin(best))
+    return rows[row] * step if best[row] < _LEFT**2 * best[most] else 0.0
+
+
+def _signals(stretch: Stretch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Turn of the motor over N, load angle [rad], and logged torque on the load [N m], of the first samples."""
+    experiment, part = stretch.experiment, slice(stretch.start, min(stretch.stop, stretch.start + _ENOUGH))
+    turn, x = experiment.measured[part, 0], experiment.measured[part, -1]
+    load = experiment.load_torque
+    T_l = np.zeros(x.size) if load is None else np.asarray(load.coefficients)[part, 0]
+    return turn - turn[0], turn - x - (turn - x)[0], T_l
+
+
+def _unexplained(
+    model: TwoInertiaModel, parts: Sequence[tuple[np.ndarray, ...]], width: int, step: float, row: int, most: int
+) -> float:
+    """Unexplained share of the load's mean square acceleration, if its readings are `row` rows late."""
+    tests, slopes, curvatures = blind_functions(width, step)
+    rows, hop = [], max(1, width // 4)
+    for turn, angle, T_l in parts:
+        inner = slice(most, turn.size - most)
+        if turn.size < 2 * most + 3 * width:
+            continue
+        load, x = np.roll(angle, -row)[inner], (turn - np.roll(angle, -row))[inner]
+        terms = [(x, tests), (x**3, tests), (x, slopes), (load, slopes), (np.sign(np.gradient(load)), tests)]
+        right = [(float(model.drive.J_l) * load, curvatures), (-T_l[inner], tests)]
+        columns = [weak_form.against(signal, functions, hop) for signal, functions in (*terms, *right)]
+        rows.append(np.stack([*columns[:5], columns[5] + columns[6]], axis=1))
+    if not rows:
+        return 1.0
+    matrix = np.concatenate(rows)
+    matrix = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    solution = np.linalg.lstsq(matrix[:, :-1], matrix[:, -1], rcond=1e-10)[0]
+    return float(np.sum((matrix[:, -1] - matrix[:, :-1] @ solution) ** 2))

@@ -1,0 +1,80 @@
+"""Readings of a late encoder: whole rows of the delay are found, and moved."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rig
+from fitting.estimation.encoder_delay import delay_of_load
+from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.late_readings import aligned, is_aligned, unaligned, with_load_moved
+from hdjax import TwoInertiaModel
+from hdjax.effects.sensing import EncoderDelay, LoadEncoderDelay, MotorEncoderDelay
+
+COUNT = 1500
+MODEL = rig.drive_model()
+LOGS = {
+    "nothing": rig.drive_experiment(COUNT),
+    "friction of the motor": rig.drive_experiment(COUNT, motor_friction=(0.2, 1.0)),
+    "kinematic error": rig.drive_experiment(COUNT, kinematic=(1e-4, 0.0)),
+    "weight on the load": rig.drive_experiment(COUNT, gravity=5.0),
+    "backlash": rig.drive_experiment(COUNT, gap=3e-4),
+}
+
+
+def with_late_load(experiment: Experiment, rows: int) -> Experiment:
+    """The load's angle read some rows late, or early."""
+    turn, x = experiment.measured.T
+    load = (turn - x)[np.clip(np.arange(COUNT) - rows, 0, COUNT - 1)]
+    return replace(experiment, measured=np.stack([turn, turn - load], axis=1))
+
+
+@pytest.mark.parametrize("beside", LOGS)
+@pytest.mark.parametrize("rows", [-7, 0, 10])
+def test_whole_rows_between_the_encoders_are_found_beside_any_effect(beside: str, rows: int):
+    """To a row where the effect bends the phase of the load as well; no delay is claimed where there is none."""
+    late = with_late_load(LOGS[beside], rows)
+    found = delay_of_load(MODEL, (Stretch(late, 20, COUNT - 20),)) / rig.STEP
+    off = 1 if rows and beside in ("kinematic error", "backlash") else 0
+    assert abs(found - rows) < off + 1e-6
+
+
+def test_delay_is_not_looked_for_where_the_twist_was_not_measured():
+    motor = replace(LOGS["nothing"], measured=LOGS["nothing"].measured[:, :1], outputs=("motor_angle",))
+    model = TwoInertiaModel(MODEL.drive, measured=("motor_angle",))
+    assert delay_of_load(model, (Stretch(motor, 0, COUNT),)) == 0.0
+
+
+@settings(max_examples=10)
+@given(rows=st.integers(-9, 9), invalid=st.integers(20, COUNT - 20))
+def test_moved_readings_are_those_of_the_undelayed_encoder(rows: int, invalid: int):
+    """Rows whose reading lies beyond the log or is invalid are invalid; moving back restores the others."""
+    logged = LOGS["nothing"]
+    weight = np.ones(COUNT)
+    weight[invalid] = 0.0
+    late = replace(with_late_load(logged, rows), weight=weight)
+    moved = with_load_moved(late, rows * rig.STEP)
+    assert moved.weight is not None and moved.weight[invalid] == moved.weight[invalid - rows] == 0.0
+    assert COUNT - 4 - abs(rows) <= np.sum(moved.weight) <= COUNT - 1 - abs(rows)
+    valid = moved.weight > 0
+    np.testing.assert_allclose(moved.measured[valid], logged.measured[valid], atol=1e-12)
+    back = with_load_moved(moved, 0.0)
+    valid = np.asarray(back.weight) > 0
+    np.testing.assert_allclose(back.measured[valid], late.measured[valid], atol=1e-12)
+
+
+@pytest.mark.parametrize("load, motor", [(0.0, 0.0), (3.4, 0.0), (0.0, 3.6), (7.9, 2.6)])
+def test_laws_of_aligned_delays_span_at_most_half_a_row(load: float, motor: float):
+    effects = LoadEncoderDelay(delay=load * rig.STEP), MotorEncoderDelay(delay=motor * rig.STEP)
+    late = MODEL.with_effects(*effects)
+    model, (stretch,) = aligned(late, (Stretch(LOGS["nothing"], 0, COUNT),))
+    assert is_aligned(model, (stretch,))
+    own = [e for e in model.effects if isinstance(e, EncoderDelay)]
+    assert all(abs(float(e.load_delay())) <= 0.5001 * rig.STEP for e in own)
+    rows = round(load) - round(motor)
+    assert stretch.experiment.load_moved == pytest.approx(rows * rig.STEP)
+    assert [float(e.moved) for e in unaligned(model).effects if isinstance(e, EncoderDelay)] == [0.0, 0.0]
+    assert aligned(MODEL, (stretch,))[1][0].experiment.load_moved == 0.0
