@@ -55,7 +55,7 @@ class FreeParameters(eqx.Module):
 
     def _each(self, model: Model, entry: Callable[..., Any]) -> Float[Array, " parameters"]:
         """The array library, then for each parameter its value, whether it is logarithmic, and its unit."""
-        values = [model.get(p) for p in self.paths]
+        values = model.values(self.paths)
         library, (*values, scale) = _library(*values, self.scale)
         with np.errstate(all="ignore"):
             entries = [entry(library, *own) for own in zip(values, self.logarithmic, scale, strict=True)]
