@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from fitting.record import Record
 from hdjax import Drive, Model
 from hdjax.drive import Prior
 from hdjax.effects import Effect
@@ -26,7 +27,7 @@ MESH = ("K", "alpha", "B_sp")
 """Fitted parameters of the mesh."""
 
 
-class FreeParameters(eqx.Module):
+class FreeParameters(Record):
     """The parameters that a fit changes, as a vector of order one.
 
     A positive parameter is represented by its logarithm, any other in units of `scale`.

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Complex, Float
 from fitting.estimation.estimate import Fit
 from fitting.estimation.projection import solved
 from fitting.first_order.spectral_lines import without_lines
+from fitting.record import Record
 
 DRAWS = 200
 """Number of surrogates of the residual of each part of the data."""
@@ -56,7 +57,7 @@ class Surrogates(eqx.Module):
         twice[-1] -= self.length % 2 == 0
         found: Any = rfft(series, axis=0, overwrite_x=True, workers=-1)
         across = twice / self.length * np.einsum("of,foc->fc", self.spectrum, found.conj())
-        return across.real.T @ self.turns.real.T - across.imag.T @ self.turns.imag.T
+        return np.real(across.T @ self.turns.T)
 
 
 def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
@@ -105,7 +106,7 @@ def _turn(random: np.random.Generator, spectrum: np.ndarray) -> Complex[np.ndarr
     return turn
 
 
-class Scores(eqx.Module):
+class Scores(Record):
     """Inner products of sensitivities, of residual and of surrogates.
 
     Attributes:
