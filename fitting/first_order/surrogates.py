@@ -57,7 +57,7 @@ class Surrogates(eqx.Module):
         twice[-1] -= self.length % 2 == 0
         found: Any = rfft(series, axis=0, overwrite_x=True, workers=-1)
         across = twice / self.length * np.einsum("of,foc->fc", self.spectrum, found.conj())
-        return np.real(across.T @ self.turns.T)
+        return np.real(self.turns @ across).T
 
 
 def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
