@@ -117,6 +117,13 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
     return FreeParameters(tuple(paths), logarithmic, *(jnp.asarray(np.array(n, dtype=float)) for n in numbers))
 
 
+def as_they_are(model: Model, paths: Sequence[str]) -> tuple[FreeParameters, Float[Array, " parameters"]]:
+    """The parameters at `paths` neither scaled nor by their logarithm, and their values, equal to the last bit."""
+    none = jnp.asarray(np.zeros(len(paths)))
+    values = jnp.asarray(np.array([float(v) for v in model.values(paths)], dtype=float))
+    return FreeParameters(tuple(paths), (False,) * len(paths), none + 1.0, none, none), values
+
+
 def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:
     """The model of a drive with other priors."""
     assert isinstance(model.drive, Drive)
