@@ -135,20 +135,22 @@ class Model(eqx.Module):
 
     def get(self, path: str) -> Array:
         """The parameter at a dotted path."""
-        return self._at(path)
+        return self.values((path,))[0]
 
-    def _at(self, path: str) -> Any:
-        """The leaf at a dotted path, for `eqx.tree_at`, which inserts placeholders."""
-        if "." not in path:
-            return getattr(self.drive, path)
-        name, field = path.split(".")
-        return own_value(self.effect(name), field)
+    def values(self, paths: Sequence[str]) -> list[Any]:
+        """The parameters at dotted paths. In `eqx.tree_at` they are placeholders."""
+        places = [path.rpartition(".") for path in paths]
+        # Not `self.effect`: equinox makes a module of a method at each look-up.
+        return [
+            own_value(next(e for e in self.effects if e.name == of), name) if of else getattr(self.drive, name)
+            for of, _, name in places
+        ]
 
     def replace(self, values: Mapping[str, ArrayLike]) -> "Model":
         """The same model with other values at the given dotted paths."""
         paths = tuple(values)
         arrays = [as_scalar(values[p]) for p in paths]
-        return eqx.tree_at(lambda m: [m._at(p) for p in paths], self, arrays)
+        return eqx.tree_at(lambda m: m.values(paths), self, arrays)
 
     def _of(self, kind: type[_Kind]) -> tuple[_Kind, ...]:
         return tuple(e for e in self.effects if isinstance(e, kind))

@@ -119,7 +119,7 @@ def _evaluated(model: Model, name: str, uncertainty: Uncertainty, values: np.nda
         names = [axis.variable for axis in effect.axes]
         return effect.value(replace(Motion(x=zero, v=zero), **dict(zip(names, row, strict=True))))
 
-    return with_errors(at, jnp.stack([model.get(path) for path in paths]), covariance, values)
+    return with_errors(at, jnp.stack(model.values(paths)), covariance, values)
 
 
 def with_errors(

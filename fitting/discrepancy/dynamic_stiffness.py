@@ -55,5 +55,5 @@ def learned_response(name: str, model: Model, uncertainty: Uncertainty) -> Learn
         assert isinstance(own, Lagging)
         return jnp.log(jnp.abs(own.stiffness(omega, moved.drive)))
 
-    found, std = with_errors(size, jnp.stack([model.get(path) for path in paths]), covariance, omega)
+    found, std = with_errors(size, jnp.stack(model.values(paths)), covariance, omega)
     return LearnedResponse(PLACES[place.name], effect.angle, omega / (2 * np.pi), np.exp(found), std)

@@ -6,6 +6,7 @@ is linear in the unknowns for a given delay. It holds whatever acts on the motor
 unexplained: near the resonance the load does not follow the motor, so that nothing else shifts their phase alike.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +24,8 @@ LONGEST_DELAY = 1e-2
 _LEFT = 0.5
 # Most rows of a delay, and of a stretch, that are looked at: more take longer and tell little.
 _MOST_ROWS, _ENOUGH = 64, 4000
+# Rows between the delays of the first search: the error changes smoothly over a part of a period.
+_APART = 4
 
 
 def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
@@ -37,12 +40,16 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
         return 0.0
     step = stretches[0].experiment.time_step
     most = int(min(LONGEST_DELAY / step, _MOST_ROWS))
-    rows = range(-most, most + 1)
     parts = [_signals(stretch) for stretch in stretches]
-    left = [[_unexplained(model, parts, width, step, row, most) for row in rows] for width in WIDTHS]
-    best = min(left, key=min)
-    row = int(np.argmin(best))
-    return rows[row] * step if best[row] < _LEFT**2 * best[most] else 0.0
+
+    def left(row: int, width: int) -> float:
+        return _unexplained(model, parts, width, step, row, most)
+
+    coarse = range(-(most // _APART) * _APART, most + 1, _APART)
+    near, width = min(itertools.product(coarse, WIDTHS), key=lambda pair: left(*pair))
+    close = range(max(near - _APART, -most), min(near + _APART, most) + 1)
+    row = min(close, key=lambda row: left(row, width))
+    return row * step if left(row, width) < _LEFT**2 * left(0, width) else 0.0
 
 
 def _signals(stretch: Stretch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from fitting.errors import DataError
 from fitting.logs.gaps import bridged
 from fitting.logs.log import Log
+from fitting.record import Record
 from hdjax import Hold, PiecewisePolynomial, sampled
 from hdjax.dynamics import BOTH_ANGLES
 
@@ -20,7 +21,7 @@ _LONGEST_STEP = 1.5
 _MOST_PUT_IN = 10
 
 
-class Experiment(eqx.Module):
+class Experiment(Record):
     """One log on its sample grid.
 
     Attributes:

@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from fitting.record import Record
 from hdjax import Drive, Model
 from hdjax.drive import Prior
 from hdjax.effects import Effect
@@ -26,7 +27,7 @@ MESH = ("K", "alpha", "B_sp")
 """Fitted parameters of the mesh."""
 
 
-class FreeParameters(eqx.Module):
+class FreeParameters(Record):
     """The parameters that a fit changes, as a vector of order one.
 
     A positive parameter is represented by its logarithm, any other in units of `scale`.
@@ -55,7 +56,7 @@ class FreeParameters(eqx.Module):
 
     def _each(self, model: Model, entry: Callable[..., Any]) -> Float[Array, " parameters"]:
         """The array library, then for each parameter its value, whether it is logarithmic, and its unit."""
-        values = [model.get(p) for p in self.paths]
+        values = model.values(self.paths)
         library, (*values, scale) = _library(*values, self.scale)
         with np.errstate(all="ignore"):
             entries = [entry(library, *own) for own in zip(values, self.logarithmic, scale, strict=True)]
@@ -114,6 +115,13 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
     known_before = [priors.get(p, Prior(p, 1.0, math.inf)) for p in paths]
     numbers = units, [math.log(p.value) for p in known_before], [1.0 / p.tolerance for p in known_before]
     return FreeParameters(tuple(paths), logarithmic, *(jnp.asarray(np.array(n, dtype=float)) for n in numbers))
+
+
+def as_they_are(model: Model, paths: Sequence[str]) -> tuple[FreeParameters, Float[Array, " parameters"]]:
+    """The parameters at `paths` neither scaled nor by their logarithm, and their values, equal to the last bit."""
+    none = jnp.asarray(np.zeros(len(paths)))
+    values = jnp.asarray(np.array([float(v) for v in model.values(paths)], dtype=float))
+    return FreeParameters(tuple(paths), (False,) * len(paths), none + 1.0, none, none), values
 
 
 def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import FreeParameters, free_parameters
+from fitting.estimation.free_parameters import FreeParameters, as_they_are
 from fitting.estimation.late_readings import aligned, moved_readings, with_load_moved
 from fitting.estimation.problem import Segmentation, suggested_substeps
 from fitting.estimation.reach import Condition, Quantity, Range, ranges, reach
@@ -127,7 +127,7 @@ def free_run(
         covariance: of the measurement noise of the outputs.
         halo: intervals of torque before the start, for delays.
         substeps: solver steps in a sample interval.
-        like: a fit of the same model, whose compiled program is reused for the initial states.
+        like: a fit of the same model, whose compiled program is reused.
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
@@ -135,8 +135,9 @@ def free_run(
     model, stretches = aligned(model, stretches)
     starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))
-    problem = whole_simulations(model, free_parameters(model, (), {}), stretches, halo, substeps)
-    outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
+    free, values = as_they_are(model, () if like is None else like.free.paths)
+    problem = whole_simulations(model, free, stretches, halo, substeps)
+    outputs = np.asarray(simulate(problem, Unknowns(values, states))[0])
     runs = []
     late = stretches[0].experiment.load_moved
     for stretch, output in zip(logged, outputs, strict=True):

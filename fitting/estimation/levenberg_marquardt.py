@@ -19,6 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.estimation.residual import Blocks, Products, Unknowns, moved_gap
+from fitting.record import Record
 from hdjax.compilation import library_of, on_host
 
 # Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
@@ -95,7 +96,7 @@ def _collected(each: Any, index: Any) -> Any:
     return total
 
 
-class ArrowSystem(eqx.Module):
+class ArrowSystem(Record):
     """The normal equations of [`Blocks`][], in blocks. The gradients have two columns: of the residual as it is, and
     what closing the gaps adds to it.
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import LARGEST_LOG
 from fitting.estimation.residual import LOST, Blocks, Problem, Products, Unknowns
+from fitting.record import Record
 from hdjax import PiecewisePolynomial
 from hdjax.compilation import is_traced, library_of, on_host
 from hdjax.effects import ActuatorEffect
@@ -171,7 +172,7 @@ def _march(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode, w
     return (march_lanes if is_traced(address, lanes) else march_arrays)(address, lanes, hidden, mode, wanted)
 
 
-class Task(eqx.Module):
+class Task(Record):
     """A problem that can be evaluated at any point outside JAX programs.
 
     Attributes:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -11,12 +10,13 @@ from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.linear_response import Followed, Forces, respond
 from fitting.estimation.residual import Blocks
 from fitting.estimation.segments import Segments
+from fitting.record import Record
 
 # Numbers whose square overflows.
 _NOTHING = 1e-200
 
 
-class FirstStates(eqx.Module):
+class FirstStates(Record):
     """Sensitivity of a residual to the initial state of each simulation (a chain of joined segments).
 
     Attributes:
@@ -64,7 +64,7 @@ class FirstStates(eqx.Module):
         return self.without(found.by_parameter, found.before_by_parameter)
 
 
-class Answers(eqx.Module):
+class Answers(Record):
     """Response of whitened outputs to forces along a motion, projected orthogonal to the initial states.
 
     Attributes:

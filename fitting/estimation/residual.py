@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.segments import Segments
+from fitting.record import Record
 from hdjax import Model
 from hdjax.compilation import library_of
 from hdjax.engine import Kernel
@@ -91,7 +92,7 @@ class Blocks(eqx.Module):
     before_by_state: Float[Array | np.ndarray, "segments states states"]
 
 
-class Products(eqx.Module):
+class Products(Record):
     """Products of residual and Jacobian for the normal equations.
 
     Attributes:

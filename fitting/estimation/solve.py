@@ -130,7 +130,7 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
 def _left_over(problem: Problem, rows: Float[Array | np.ndarray, "segments rows"]) -> LeftOver:
     """What the rows of a residual say."""
     segments, found = problem.segments, np.asarray(rows)
-    measured, weight = np.asarray(segments.measured), np.asarray(segments.weight)[:, :, None]
+    measured, weight = np.asarray(segments.measured), np.asarray(segments.weight)
     white = found[:, : measured[0].size].reshape(measured.shape)
     error = white @ np.linalg.inv(np.asarray(problem.whitening)).T
     return LeftOver(error, _covariance(error, measured, weight), np.sum(found**2, axis=1))
@@ -139,10 +139,14 @@ def _left_over(problem: Problem, rows: Float[Array | np.ndarray, "segments rows"
 def _covariance(error: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Covariance of the output error. Runaway simulations count as large, not as unknown."""
     samples = np.sum(weight)
-    mean = np.sum(measured * weight, axis=(0, 1)) / samples
-    span = np.sqrt(np.sum((measured - mean) ** 2 * weight, axis=(0, 1)) / samples)
-    rows = (np.clip(np.nan_to_num(error, nan=np.inf), -10 * span, 10 * span) * weight).reshape(-1, span.size)
+    # Output by output: numpy is slow along an axis of two.
+    spans, rows = [], []
+    for own, told in zip(np.moveaxis(error, -1, 0), np.moveaxis(measured, -1, 0), strict=True):
+        mean = np.sum(told * weight) / samples
+        spans.append(np.sqrt(np.sum((told - mean) ** 2 * weight) / samples))
+        rows.append(np.fmax(np.fmin(own, 10 * spans[-1]), -10 * spans[-1]) * weight)
+    span, flat = np.array(spans), np.reshape(rows, (len(rows), -1))
     # The floor keeps an output that the model follows to the last bit from becoming infinitely certain.
     # Nor may two outputs that run away alike be one.
-    covariance = rows.T @ rows / samples
+    covariance = flat @ flat.T / samples
     return covariance + np.diag((1e-9 * span + 1e-300) ** 2 + 1e-12 * np.diag(covariance))

@@ -7,7 +7,7 @@ import numpy as np
 
 from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit, half_log_determinant
-from fitting.estimation.free_parameters import free_parameters
+from fitting.estimation.free_parameters import as_they_are
 from fitting.estimation.free_run import whole_simulations
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.residual import Unknowns
@@ -144,9 +144,9 @@ def without_gaps(found: Fit) -> Fit:
     """The fit with the covariance of the errors of one simulation of each stretch, from its fitted initial state."""
     first = np.cumsum(found.pieces) - found.pieces
     states = jnp.asarray(np.asarray(found.unknowns.states)[first])
-    nothing = free_parameters(found.model, (), {})
-    problem = whole_simulations(found.model, nothing, found.stretches, found.segmentation.halo, found.substeps)
-    outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
+    free, values = as_they_are(found.model, found.free.paths)
+    problem = whole_simulations(found.model, free, found.stretches, found.segmentation.halo, found.substeps)
+    outputs = np.asarray(simulate(problem, Unknowns(values, states))[0])
     segments = problem.segments
     error = (np.asarray(segments.measured) - outputs)[np.asarray(segments.weight) > 0]
     covariance = error.T @ error / len(error)

@@ -20,7 +20,7 @@ from fitting.estimation.segments import Segments
 from fitting.first_order.close_following import followed_closely
 from fitting.first_order.motion import Along, along
 from fitting.first_order.regressors import regressors
-from fitting.first_order.surrogates import surrogates
+from fitting.first_order.surrogates import Surrogates
 from hdjax.effects import Effect
 
 # Numbers in the columns of a batch, limited by memory.
@@ -43,7 +43,7 @@ class FittedMotion(eqx.Module):
     seen: Along
     answers: Answers
     residual: Float[np.ndarray, "segments samples outputs"]
-    surrogates: Float[np.ndarray, "draws segments rows"]
+    surrogates: Surrogates
 
 
 def fitted_motion(fit: Fit, seed: int) -> FittedMotion:
@@ -66,7 +66,7 @@ def fitted_motion(fit: Fit, seed: int) -> FittedMotion:
         seen=along(fit.model, followed, segments, fit.stretches),
         answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
         residual=residual,
-        surrogates=surrogates(fit, seed)[:, : len(residual)],
+        surrogates=Surrogates.of(fit, seed),
     )
 
 

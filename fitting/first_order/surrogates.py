@@ -4,11 +4,12 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from fitting.estimation.estimate import Fit
 from fitting.estimation.projection import solved
 from fitting.first_order.spectral_lines import without_lines
+from fitting.record import Record
 
 DRAWS = 200
 """Number of surrogates of the residual of each part of the data."""
@@ -18,20 +19,45 @@ PARTNERS = 5
 draws, and the smallest possible p-value is 1/1001."""
 
 
-def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
-    """Residuals with the same spectra and cross-spectra and random phases."""
-    from scipy.fft import irfft
+class Surrogates(eqx.Module):
+    """Residuals with the same spectra and cross-spectra and random phases.
 
-    random = np.random.default_rng(seed)
-    weight = np.asarray(fit.problem.segments.weight) > 0
-    error = fit.white_error
-    spectrum, length = _noise_spectrum(error[weight].T)
-    place = (np.cumsum(weight).reshape(weight.shape) - 1) % length
-    found = np.empty((DRAWS, *error.shape))
-    for draw in range(DRAWS):
-        surrogate: Any = irfft(spectrum * _turn(random, spectrum), n=length, overwrite_x=True, workers=-1)
-        np.multiply(surrogate.T[place], weight[..., None], out=found[draw])
-    return found.reshape(DRAWS, error.shape[0], -1)
+    Attributes:
+        spectrum: of each output's residual.
+        turns: random phases of each surrogate.
+        length: number of samples after which they repeat.
+        counts: valid samples.
+    """
+
+    spectrum: Complex[np.ndarray, "outputs frequencies"]
+    turns: Complex[np.ndarray, "draws frequencies"]
+    length: int = eqx.field(static=True)
+    counts: Bool[np.ndarray, "segments samples"]
+
+    @classmethod
+    def of(cls, fit: Fit, seed: int) -> "Surrogates":
+        """Surrogates of a fit's whitened residual, in its segments with data."""
+        random = np.random.default_rng(seed)
+        weight = np.asarray(fit.problem.segments.weight) > 0
+        spectrum, length = _noise_spectrum(fit.white_error[weight].T)
+        turns = np.stack([_turn(random, spectrum) for _ in range(DRAWS)])
+        return cls(spectrum, turns, length, weight[: fit.pieces.sum()])
+
+    def against(
+        self, columns: Float[np.ndarray, "segments samples outputs columns"]
+    ) -> Float[np.ndarray, "columns draws"]:
+        """Inner product of each column with each surrogate, by Parseval's theorem: no surrogate is made."""
+        from scipy.fft import rfft
+
+        series = columns[self.counts]
+        series, further = series[: self.length], series[self.length :]
+        series[: len(further)] += further
+        # Each frequency also represents its negative, except for the last one of an even number of samples.
+        twice = np.full((self.turns.shape[1], 1), 2.0)
+        twice[-1] -= self.length % 2 == 0
+        found: Any = rfft(series, axis=0, overwrite_x=True, workers=-1)
+        across = twice / self.length * np.einsum("of,foc->fc", self.spectrum, found.conj())
+        return np.real(self.turns @ across).T
 
 
 def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
@@ -80,7 +106,7 @@ def _turn(random: np.random.Generator, spectrum: np.ndarray) -> Complex[np.ndarr
     return turn
 
 
-class Scores(eqx.Module):
+class Scores(Record):
     """Inner products of sensitivities, of residual and of surrogates.
 
     Attributes:
@@ -101,14 +127,13 @@ class Scores(eqx.Module):
         columns: Float[np.ndarray, "segments samples outputs columns"],
         weight: Float[np.ndarray, "segments samples"],
         residual: Float[np.ndarray, "segments samples outputs"],
-        surrogates: Float[np.ndarray, "draws segments rows"],
+        surrogates: Surrogates,
     ) -> "Scores":
         """From the whitened outputs' derivatives, the weight of each sample, residual and surrogates."""
         flat = columns.reshape(-1, columns.shape[-1])
         # Where the model diverges in every segment, there are no valid samples.
         samples = max(float(np.sum(weight)), 1.0)
-        against = (surrogates.reshape(len(surrogates), -1) @ flat).T
-        return cls(flat.T @ flat, flat.T @ residual.reshape(-1), against, samples)
+        return cls(flat.T @ flat, flat.T @ residual.reshape(-1), surrogates.against(columns), samples)
 
     def columns(self, which: list[int]) -> "Scores":
         """The scores of some columns."""

@@ -103,7 +103,7 @@ def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[A
         whole = eqx.combine(jax.tree.unflatten(tree, others), rest)
         return whole.replace(dict(zip(paths, free, strict=True))) if paths else whole
 
-    return [model.get(p) for p in paths], leaves, joined
+    return model.values(paths), leaves, joined
 
 
 def structure(model: Any, paths: Sequence[str], signals: Sequence[str]) -> Hashable:

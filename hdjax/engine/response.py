@@ -55,9 +55,8 @@ class Pushed(Model):
         """The paths of the force's numbers."""
         return tuple(f"{kind}.{i}" for kind in ("steady", "rising") for i in range(len(self.steady)))
 
-    def _at(self, path: str) -> Any:
-        kind, index = path.split(".")
-        return getattr(self, kind)[int(index)]
+    def values(self, paths: Sequence[str]) -> list[Any]:
+        return [getattr(self, kind)[int(index)] for kind, index in (path.split(".") for path in paths)]
 
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         return self.model.motion(state[:-1], conditions)

@@ -17,7 +17,7 @@ from fitting.estimation.problem import Segmentation
 from fitting.estimation.projection import solved, without_undetermined
 from fitting.estimation.residual import Blocks
 from fitting.estimation.whole_log_fit import follows
-from fitting.first_order.surrogates import DRAWS, PARTNERS, chance_of_gain, surrogates
+from fitting.first_order.surrogates import DRAWS, PARTNERS, Surrogates, chance_of_gain
 from hdjax import Model
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias
@@ -124,6 +124,19 @@ def test_seed_changes_only_the_surrogates():
     assert first.leads[0].gain == pytest.approx(other.leads[0].gain, rel=1e-12)
 
 
+@pytest.mark.parametrize("shorter", [0, 1])
+def test_scores_of_surrogates_are_inner_products_with_them(shorter: int):
+    drawn = Surrogates.of(fits()[0], 0)
+    # Even and odd lengths; one sample beyond the length repeats the first.
+    used = slice(drawn.turns.shape[1] - shorter)
+    lines = {"turns": drawn.turns[:, used], "spectrum": drawn.spectrum[:, used]}
+    drawn = dataclasses.replace(drawn, length=drawn.length - shorter, **lines)
+    columns = np.random.default_rng(1).normal(size=(*drawn.counts.shape, 1, 3))
+    series = np.fft.irfft(drawn.spectrum * drawn.turns, n=drawn.length)
+    repeated = series[:, np.arange(drawn.counts.sum()) % drawn.length]
+    np.testing.assert_allclose(drawn.against(columns), (repeated @ columns[drawn.counts][:, 0]).T, rtol=0, atol=1e-10)
+
+
 def test_surrogates_exclude_spectral_lines_of_the_residual():
     """A line is not coloured noise; surrogates with the line would have too large gains."""
     fitted, _ = fits()
@@ -132,10 +145,11 @@ def test_surrogates_exclude_spectral_lines_of_the_residual():
     line = 3.0 * np.sin(0.3 * time)[..., None]
     white = eqx.tree_at(lambda f: f.problem.whitening, fitted, jnp.eye(1))
     kept = np.asarray(fitted.problem.segments.weight) > 0
+    each_sample = np.eye(noise.size).reshape(*noise.shape, -1)
     drawn = {}
     for name, error in (("noise", noise), ("both", noise + line)):
         given = eqx.tree_at(lambda f: f.error, white, jnp.asarray(error))
-        series = surrogates(given, 0).reshape(DRAWS, *noise.shape)[:, kept]
+        series = Surrogates.of(given, 0).against(each_sample)[kept.ravel()]
         drawn[name] = float(np.std(series))
     assert drawn["noise"] == pytest.approx(1.0, abs=0.03)
     # The skirts of the line remain; with the whole line it would be 2.3.

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rig
-from fitting.estimation.free_parameters import base_paths, effect_paths, free_parameters, strength_paths
+from fitting.estimation.free_parameters import as_they_are, base_paths, effect_paths, free_parameters, strength_paths
 from hdjax.effects import BY_NAME, CATALOGUE, Effect, Scales
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.hysteresis import BoucWen
@@ -47,6 +47,12 @@ def test_unpack_inverts_pack(K: float, alpha: float, B_sp: float, T_c: float):
     for path in PATHS:
         np.testing.assert_allclose(back.get(path), wanted.get(path), rtol=1e-13, atol=1e-290)
     assert float(back.get("J_m")) == rig.J_M
+
+
+def test_parameters_as_they_are_keep_every_bit():
+    free, values = as_they_are(model(K=0.1 + 0.2, alpha=-1.0 / 3.0), PATHS)
+    back = free.unpack(model(), values)
+    assert back.values(PATHS) == model(K=0.1 + 0.2, alpha=-1.0 / 3.0).values(PATHS)
 
 
 @settings(max_examples=20)

@@ -8,8 +8,11 @@ import pytest
 
 import fitting.estimation.free_run as module
 import rig
+from fitting.estimation.estimate import fit
 from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
+from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.free_run import WINDOW, FreeRun, free_run, rms_error
+from fitting.estimation.problem import Segmentation
 from hdjax import Model
 
 COUNT = 600
@@ -64,6 +67,16 @@ def test_free_run_uses_only_outputs_of_the_initial_state_window(moving: Experime
     measured[WINDOW - 1, 1] += 20 * X_NOISE
     assert np.any(run(dataclasses.replace(moving, measured=measured)).predicted != seeing.predicted)
     assert blind.rmse == np.inf
+
+
+def test_free_run_by_the_machine_code_of_a_fit_is_the_same(moving: Experiment):
+    stretches = [Stretch(moving, 0, COUNT)]
+    found = fit(rig.drive_model(), stretches, base_paths(rig.drive_model()), Segmentation(COUNT, substeps=1))
+    plain, like = (
+        free_run(found.model, stretches, covariance=NOISE, substeps=1, like=given)[0] for given in (None, found)
+    )
+    # The initial state goes through the fit's scaled parameters, which rounds them.
+    np.testing.assert_allclose(like.predicted, plain.predicted, rtol=0, atol=1e-6 * X_NOISE)
 
 
 def test_free_run_may_start_inside_a_log(moving: Experiment):
