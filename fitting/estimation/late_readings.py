@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
 
 from fitting.estimation.experiment import Experiment, Stretch
 from hdjax import Model
@@ -84,6 +83,9 @@ def moved_readings(
     interpolated. Those beyond the ends are held."""
     if by == 0.0:
         return outputs
+    # Imported here: few logs need it.
+    from scipy.interpolate import CubicSpline
+
     at = np.clip(time + by, time[0], time[-1])
 
     def later(values: np.ndarray) -> np.ndarray:
