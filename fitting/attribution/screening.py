@@ -104,6 +104,9 @@ def screen(
     for effect, own, states, (fitted, unseen) in _responses(training, held_out, proposals, seed, strays=strays):
         used = [*range(known), *(skipped + known + c for c in own)]
         fitted, unseen = fitted.columns(used), unseen.columns(used)
+        if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
+            # Its response diverges along this motion: nothing is known to first order.
+            continue
         columns = list(range(known, known + len(own)))
         paths = strength_paths(effect)
         info = model.with_effects(effect).parameters()

@@ -131,9 +131,11 @@ class Scores(Record):
     ) -> "Scores":
         """From the whitened outputs' derivatives, the weight of each sample, residual and surrogates."""
         flat = columns.reshape(-1, columns.shape[-1])
+        with np.errstate(over="ignore", invalid="ignore"):
+            gram = flat.T @ flat
         # Where the model diverges in every segment, there are no valid samples.
         samples = max(float(np.sum(weight)), 1.0)
-        return cls(flat.T @ flat, flat.T @ residual.reshape(-1), surrogates.against(columns), samples)
+        return cls(gram, flat.T @ residual.reshape(-1), surrogates.against(columns), samples)
 
     def columns(self, which: list[int]) -> "Scores":
         """The scores of some columns."""

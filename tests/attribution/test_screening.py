@@ -111,6 +111,20 @@ def test_estimates_of_positive_strengths_are_not_negative(screen_with_bias: Scre
             assert float(lead.effect.b) >= 0.0
 
 
+class _Overflowing(QuadraticStiffness):
+    """An effect with so large a response that its inner products overflow."""
+
+    name = "overflowing"
+
+    def torque(self, motion, drive, state):
+        return 1e200 * self.k2 * jnp.square(motion.x)
+
+
+def test_form_whose_inner_products_overflow_is_left_out():
+    found = screen(*fits(bias=0.3), catalogue=(_Overflowing, TorqueBias))
+    assert [lead.effect.name for lead in found.leads] == ["torque_bias"]
+
+
 def test_motor_forms_are_not_screened_on_a_reduced_log():
     found = screen(*fits(), catalogue=(MotorFriction, *SOME_FORMS))
     assert len(found.leads) == len(SOME_FORMS)
