@@ -56,6 +56,7 @@ class Steps(eqx.Module):
         error: of the outputs, and its derivatives by the free parameters.
         counts: whether a sample is valid.
         log: of each segment.
+        start: expected deviation of the initial states.
         prior: covariance of the initial states.
         torque: rms torque of each log.
         lead: lead-in samples of the filter, which the likelihood omits.
@@ -67,6 +68,7 @@ class Steps(eqx.Module):
     error: Float[np.ndarray, "samples outputs columns segments"]
     counts: Bool[np.ndarray, "samples segments"]
     log: Int[np.ndarray, " segments"]
+    start: Float[np.ndarray, "states segments"]
     prior: Float[np.ndarray, "states states"]
     torque: Float[np.ndarray, " logs"]
     lead: int = eqx.field(static=True, default=_LEAD)
@@ -74,9 +76,9 @@ class Steps(eqx.Module):
     def fewer(self, segments: int) -> "Steps":
         """The same for at most so many segments, evenly spaced."""
         chosen = spread_evenly(self.log.size, segments)
-        places = (self.transition, self.push, self.readout, self.error, self.counts)
-        fewer = (*(place[..., chosen] for place in places), self.log[chosen])
-        return eqx.tree_at(lambda s: (s.transition, s.push, s.readout, s.error, s.counts, s.log), self, fewer)
+        places = (self.transition, self.push, self.readout, self.error, self.counts, self.log, self.start)
+        fewer = tuple(place[..., chosen] for place in places)
+        return eqx.tree_at(lambda s: (s.transition, s.push, s.readout, s.error, s.counts, s.log, s.start), self, fewer)
 
 
 def spread_evenly(count: int, most: int) -> Int[np.ndarray, " chosen"]:
@@ -128,6 +130,7 @@ def _predicted(
     # Covariance of the states, and beside it their means.
     known = np.zeros((size, size + columns, *torque.shape))
     spread = np.swapaxes(known[:, :size], 0, 1)
+    known[:moving, size] = steps.start[:, None]
     spread[:moving, :moving] = steps.prior[..., None, None]
     spread[own, own] = slow
     read = np.zeros((samples, outputs, size, segments))

@@ -21,9 +21,11 @@ _SETTLED = 0.02
 _STEPS = 30
 # Least relative decrease of the sum of squares over a few steps.
 _LEAST_PROGRESS = 1e-3
-# Powers of time that describe unmodelled forces within a piece; its initial state gives the constant and the slope.
-_POWERS = (2, 3)
-# They reduce the rms of noise up to a random walk at most 1.4 times; a larger reduction is due to motion.
+# Degrees of the polynomials in time that describe, within a piece, a sensor's error or the motion due to an unmodelled
+# force; the largest one that leaves enough residual degrees of freedom is used.
+_DEGREES = (3, 2)
+# They reduce the rms of noise less than so many times if its neighbouring samples correlate by 0.5 at most. A larger
+# reduction is due to motion, or to slow noise, which [`fitting.uncertainty.noise_model`][] describes.
 _MOTION = 1.5
 # Upper bound of the relative solver error (see `STEP_ANGLE`); encoder noise is far larger.
 _EXACT = 1e-6
@@ -92,8 +94,9 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     state.
 
     Within half a period an initial state explains most smooth motion, missing physics included, so that little but
-    noise remains. A strong missing force causes low powers of time within a piece. They are removed as well where they
-    exceed what noise explains. Corrected for the number of fitted values.
+    noise remains. A strong missing force or a sensor's error adds a polynomial in time within a piece: even a constant,
+    since the initial twist follows from the motion that it causes. It is removed as well where it exceeds what noise
+    explains. Corrected for the number of fitted values.
 
     Args:
         found: a fit; its parameters are fixed, and its compiled program is used.
@@ -156,20 +159,25 @@ def _states_freedom(problem: Problem, seen: Blocks) -> float:
 
 
 def _smoothed(problem: Problem, seen: Blocks, piece: int) -> tuple[Float[np.ndarray, "outputs outputs"], float, float]:
-    """Residual of pieces after fitting a few powers of time to each output: squares, samples, and number of fitted
+    """Residual of pieces after fitting a polynomial in time to each output: squares, samples, and number of fitted
     values. Pieces whose simulation diverges are omitted."""
     outputs = problem.segments.measured.shape[2]
     rows = np.asarray(seen.residual)[:, : piece * outputs]
     weight = np.asarray(problem.segments.weight)[:, :piece]
     kept = weight.any(axis=1) & (np.abs(rows) < RUNAWAY).all(axis=1)
-    time = np.linspace(-1.0, 1.0, piece)[:, None] ** np.arange(2 + len(_POWERS))
-    powers = np.linalg.qr(time)[0][:, list(_POWERS)]
-    moves = np.kron(powers, np.eye(outputs)) * np.repeat(weight[kept], outputs, axis=1)[:, :, None]
-    columns = np.concatenate([np.asarray(seen.by_state)[kept, : rows.shape[1]], moves], axis=2)
-    size = np.linalg.norm(columns, axis=1, keepdims=True)
-    directions, sizes, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
-    directions = directions * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
+    legendre = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, piece), 1 + max(_DEGREES), increasing=True))[0]
+    by_state = np.asarray(seen.by_state)[kept, : rows.shape[1]]
+    measured = np.repeat(weight[kept], outputs, axis=1)
+    for degree in _DEGREES:
+        moves = np.kron(legendre[:, : 1 + degree], np.eye(outputs)) * measured[:, :, None]
+        columns = np.concatenate([by_state, moves], axis=2)
+        size = np.linalg.norm(columns, axis=1, keepdims=True)
+        directions, sizes, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+        directions = directions * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
+        freedom = float(np.sum(directions**2))
+        if freedom <= (1.0 - _LEAST_LEFT) * np.sum(measured):
+            break
     white = rows[kept]
     white = white - np.einsum("srd,sd->sr", directions, np.einsum("srd,sr->sd", directions, white))
     error = white.reshape(-1, outputs) @ np.linalg.inv(np.asarray(problem.whitening)).T
-    return error.T @ error, float(np.sum(weight[kept])), float(np.sum(directions**2))
+    return error.T @ error, float(np.sum(weight[kept])), freedom

@@ -8,6 +8,8 @@ right variances the innovations of a Kalman filter are white, and their likeliho
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import expit
@@ -201,6 +203,7 @@ def _steps(fit: Fit, residual: Float[np.ndarray, "outputs outputs"]) -> Steps:
     logs = [own[spread_evenly(own.size, _SEGMENTS)] for own in logs]
     used = np.concatenate(logs)
     read = followed.readout[used]
+    off = _hidden_gaps(problem, followed.states)
     rms = np.sqrt(np.diag(residual))
     torque = np.asarray(problem.segments.torque.coefficients)
 
@@ -214,7 +217,8 @@ def _steps(fit: Fit, residual: Float[np.ndarray, "outputs outputs"]) -> Steps:
         in_time(np.concatenate([np.asarray(fit.error)[used, ..., None], _by_parameter(fit)[used]], axis=3)),
         in_time(weight[used] > 0),
         np.repeat(np.arange(len(logs)), [own.size for own in logs]),
-        np.diag(_freedom(problem.model, followed.states[used], read, rms) ** 2),
+        np.concatenate([np.zeros((len(problem.model.motion_states), used.size)), off[used].T]),
+        np.diag(_freedom(problem.model, read, rms, off[weight.any(axis=1)]) ** 2),
         np.array([max(float(np.std(torque[own, :, 0])), 1e-300) for own in logs]),
     )
 
@@ -228,9 +232,24 @@ def _by_parameter(fit: Fit) -> Float[np.ndarray, "segments samples outputs param
     return np.linalg.solve(np.asarray(fit.problem.whitening), rows)
 
 
-def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray) -> Float[np.ndarray, " states"]:
+def _hidden_gaps(problem: Problem, states: Float[np.ndarray, "segments knots states"]) -> Float[np.ndarray, "segments hidden"]:
+    """Expected minus fitted hidden initial states. They are expected as the segment before ends, or in steady state.
+
+    A fitted hidden state depends on the whole segment; if the filter began with it, memory would seem to predict noise.
+    """
+    motion = len(problem.model.motion_states)
+    begin, before = states[:, 0], np.roll(states[:, -1, motion:], 1, axis=0)
+    settled = np.asarray(jax.vmap(problem.model.settled)(jnp.asarray(begin[:, :motion])))[:, motion:]
+    goes_on = np.asarray(problem.segments.goes_on)[:, None]
+    return np.where(goes_on, before, settled) - begin[:, motion:]
+
+
+def _freedom(
+    model: Model, read: np.ndarray, rms: np.ndarray, gaps: Float[np.ndarray, "segments hidden"]
+) -> Float[np.ndarray, " states"]:
     """By how much each state may be off where a segment begins: an angle by what its own output or its rate's shows; a
-    side that no output shows, by as much as the other one."""
+    side that no output shows, by as much as the other one; a hidden state by as much as it is off the segment before.
+    """
     angles, omega_0 = len(model.motion_states) // 2, float(model.drive.omega_0)
     sides = np.array([float(model.drive.N), 1.0]) if isinstance(model, TwoInertiaModel) else np.ones(angles)
     shown = np.abs(read[0, 0][:, : 2 * angles]).reshape(-1, 2, angles)
@@ -238,8 +257,7 @@ def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray
     shown = shown[:, 0] if shown[:, 0].any() else omega_0 * shown[:, 1]
     angle = _FREE * np.max(np.where(shown > 0, rms[:, None] / np.where(shown > 0, shown, 1.0), 0.0), axis=0)
     angle = np.where(angle > 0, angle, sides * np.max(angle / sides))
-    hidden = np.std(states.reshape(-1, states.shape[-1]), axis=0)[2 * angles :]
-    return np.concatenate([angle, angle * omega_0, hidden])
+    return np.concatenate([angle, angle * omega_0, np.sqrt(np.mean(gaps**2, axis=0))])
 
 
 def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:

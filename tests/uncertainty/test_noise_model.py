@@ -16,9 +16,9 @@ import rig
 from fitting.attribution.rules import RULES
 from fitting.attribution.support import is_noise, noise_of_torque
 from fitting.estimation.engines import with_engine
-from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.estimate import Fit, Start, fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, whole
-from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.free_parameters import base_paths, fitted_paths
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.residual import Unknowns
 from fitting.loop import close_loop
@@ -32,6 +32,7 @@ from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.learned_memory import LaggingMeshTorque
 from hdjax.effects.load import GravityLoad
 from hdjax.effects.sensing import LoadEncoderEccentricity
 
@@ -137,6 +138,19 @@ def test_missing_effect_is_not_explained_as_noise(missing: dict[str, Any]):
     assert not is_noise(noise_model_of(fitted(noisy_experiment(correlation=0.95, std=0.0, count=8000, **missing))))
 
 
+def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
+    """A lag of no strength to speak of oscillates freely in each segment, with an amplitude and phase of its own."""
+    experiment = noisy_experiment(correlation=0.85, std=0.0, count=8000)
+    found = fitted(experiment)
+    span = {"lag_span": 1e-2, "rate_span": 1.0}
+    lag = LaggingMeshTorque(k=-1e-4 * rig.K, omega=2.0 * np.pi / (128 * rig.STEP), zeta=0.2, **span)
+    model = found.model.with_effects(lag)
+    more = fit(model, whole([experiment]), fitted_paths(model), Segmentation(128), start=Start(found.covariance))
+    known = measurement_noise(found).covariance
+    before, after = (noise_model(f, known, predictable=RULES.innovations, residual=found.covariance) for f in (found, more))
+    assert found.objective - more.objective > 0.05 and after.likelihood < before.likelihood
+
+
 def test_response_to_torque_noise_is_not_assigned_to_the_sensors():
     """Short pieces assign the motor's response to a very noisy torque to the noise of its encoder."""
     found = fitted(noisy_experiment(std=10.0 * STD, count=8000))
@@ -177,7 +191,8 @@ def test_likelihood_of_innovations_equals_the_gaussian_density_of_all_samples():
     error = random.normal(size=(samples, 2, 1, 1))
     shapes = {"transition": transition, "push": push, "readout": readout}
     stacked = {name: np.broadcast_to(v[..., None], (samples, *v.shape, 1)) for name, v in shapes.items()}
-    one = {"log": np.zeros(1, int), "prior": np.eye(size), "torque": np.ones(1), "lead": 0}
+    start = random.normal(size=(size, 1))
+    one = {"log": np.zeros(1, int), "start": start, "prior": np.eye(size), "torque": np.ones(1), "lead": 0}
     steps = Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), **one)
     innovations, logarithms = filtered(steps, np.array([[std]]), sensors)
     spread = np.zeros((samples, size, samples, size))
@@ -192,7 +207,8 @@ def test_likelihood_of_innovations_equals_the_gaussian_density_of_all_samples():
     lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
     own = sensors.slow * 0.9 ** lags[..., None] + sensors.white * (lags == 0)[..., None]
     seen += np.einsum("od,ikd,qd->iokq", sensors.combined, own, sensors.combined)
-    law = multivariate_normal(cov=seen.reshape(2 * samples, -1))
+    expected = [readout @ np.linalg.matrix_power(transition, i) @ start[:, 0] for i in range(samples)]
+    law = multivariate_normal(mean=np.ravel(expected), cov=seen.reshape(2 * samples, -1))
     # In units of the sensors' independent combinations.
     units = samples * np.log(np.linalg.det(sensors.combined)) + samples * np.log(2.0 * np.pi)
     likelihood = -np.sum(0.5 * innovations**2 + logarithms) - units
