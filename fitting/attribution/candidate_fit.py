@@ -104,6 +104,7 @@ def first_pass(
     hold: Hold,
     *,
     champion: Trial,
+    near: Sequence[Fit] | None = None,
     own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Fit:
     """The first pass of a challenger, from the best start after a few iterations from each.
@@ -113,20 +114,22 @@ def first_pass(
         study: the data and their segmentation.
         hold: inter-sample behaviour of the torque.
         champion: the current model.
+        near: a similar fit for each start; that of the current model where not given.
         own_states: hidden initial states of the first model's last effect, by segment.
     """
     study = study.for_rivals()
-    best, near = models[0], champion.training
+    near = [champion.training] * len(models) if near is None else near
+    best, start = models[0], near[0]
     if len(models) > 1:
         own = own_states, *[None] * (len(models) - 1)
         begun = [
-            trained(model, study, hold, near, _FIRST_STEPS, own_states=states)
-            for model, states in zip(models, own, strict=True)
+            trained(model, study, hold, beside, _FIRST_STEPS, own_states=states)
+            for model, beside, states in zip(models, near, own, strict=True)
         ]
-        near = min(begun, key=lambda found: found.objective)
-        best, own_states = near.model, None
+        start = min(begun, key=lambda found: found.objective)
+        best, own_states = start.model, None
     strategy = Strategy(_TRIAL_STEPS, begin_anew_above=champion.training.objective, give_up_above=-np.inf)
-    return trained(best, study, hold, near, strategy, own_states=own_states)
+    return trained(best, study, hold, start, strategy, own_states=own_states)
 
 
 def completed(first: Fit, study: Study, hold: Hold, *, champion: Trial, give_up_above: float = np.inf) -> Trial | None:

@@ -31,8 +31,15 @@ def try_lead(before: Trial, lead: Lead, study: Study, give_up_above: float) -> T
     return complete_refit(before, lead, begin(before, lead, study), study, give_up_above)
 
 
-def begin(before: Trial, lead: Lead, study: Study) -> Fit:
-    """The first pass of a refit; arguments as in [`try_lead`][]."""
+def begin(before: Trial, lead: Lead, study: Study, *, sibling: Trial | None = None) -> Fit:
+    """The first pass of a refit.
+
+    Args:
+        before: the current model.
+        lead: the effect.
+        study: the data, and how they are cut.
+        sibling: a refit with another form of its family, whose values are one more start.
+    """
     model = before.model
     known = model.parameters()
     moved = {}
@@ -47,7 +54,22 @@ def begin(before: Trial, lead: Lead, study: Study) -> Fit:
         *(_with_form(model, effect) for effect in lead.effect.typical(swing)),
         *(_with_form(model.replace(values), effect) for values, effect in lead.effect.imitated(model.drive, swing)),
     ]
-    return first_pass(starts, study, before.hold, champion=before, own_states=lead.own_states)
+    near = [before.training] * len(starts)
+    if sibling is not None and (model := _as_sibling(lead.effect, before, sibling)) is not None:
+        starts, near = [*starts, model], [*near, sibling.training]
+    return first_pass(starts, study, before.hold, near=near, champion=before, own_states=lead.own_states)
+
+
+def _as_sibling(effect: Effect, before: Trial, sibling: Trial) -> Model | None:
+    """The sibling's model with another form, which takes over what has the same name; None where the sibling replaces an
+    effect of the current model."""
+    *others, own = sibling.model.effects
+    if [e.name for e in others] != [e.name for e in before.model.effects]:
+        return None
+    theirs = dict(own_parameters(own))
+    for name in (n for n, _ in own_parameters(effect) if n in theirs):
+        effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, getattr(own, name))
+    return _with_form(sibling.model.without_effect(own.name), _with_positive_strengths(effect))
 
 
 def complete_refit(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_above: float) -> Trial | None:

@@ -173,7 +173,7 @@ class _Refits:
         begun = []
         for lead in leads:
             study.progress(f"refitting with {lead.effect.name}")
-            begun.append((lead, begin(self.before, lead, study)))
+            begun.append((lead, begin(self.before, lead, study, sibling=self._sibling(lead))))
         # The best one after its first pass is completed first; most others need not be.
         for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
             best = min((t.training.objective for t in self.done.values()), default=np.inf)
@@ -181,6 +181,11 @@ class _Refits:
             trial = complete_refit(self.before, lead, found, study, limit)
             if trial is not None and np.isfinite(trial.held_out.objective):
                 self.done[lead.effect.name] = trial
+
+    def _sibling(self, lead: Lead) -> Trial | None:
+        """The best refit so far with a form of the same family."""
+        refits = [t for t in self.done.values() if t.model.effects[-1].family == lead.effect.family]
+        return min(refits, key=lambda trial: trial.training.objective, default=None)
 
     def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
         # Comparable first passes need its number of solver steps.
