@@ -255,7 +255,7 @@ def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
         study.data[trial.hold][1],
         covariance=trial.training.covariance,
         halo=study.setting.halo,
-        substeps=study.setting.segmentation.substeps,
+        substeps=trial.training.substeps,
         like=trial.held_out,
     )
 

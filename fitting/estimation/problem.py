@@ -21,6 +21,8 @@ from hdjax.lanes import spread
 
 # Longest segment; longer simulations join several, which run in parallel.
 _LONGEST_SEGMENT = 256
+# Longest solver step in settling times of a bristle; above 2.8 it is unstable.
+_SETTLINGS = 2.0
 STEP_ANGLE = 0.15
 """A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
 
@@ -73,6 +75,7 @@ def pose(
     segments, substeps = segmentation.of(stretches), segmentation.substeps
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
+    substeps = max(substeps, _stable_substeps(model, stretches))
     free = free_parameters(model, paths, typical_scales(model, stretches))
     if states is None:
         states = initial_states(model, segments)
@@ -198,6 +201,13 @@ def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle
     """
     angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
     return int(np.clip(np.ceil(angle / step_angle), 1, 16))
+
+
+def _stable_substeps(model: Model, stretches: Sequence[Stretch]) -> int:
+    """Solver steps in a sample interval at which the fastest bristles stay stable."""
+    settling = [float(e.settling) for e in model.effects if hasattr(e, "settling")]
+    longest = _SETTLINGS * min(settling, default=np.inf)
+    return int(np.ceil(stretches[0].experiment.time_step / longest - 1e-9)) if settling else 1
 
 
 def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:

@@ -232,7 +232,9 @@ def _by_parameter(fit: Fit) -> Float[np.ndarray, "segments samples outputs param
     return np.linalg.solve(np.asarray(fit.problem.whitening), rows)
 
 
-def _hidden_gaps(problem: Problem, states: Float[np.ndarray, "segments knots states"]) -> Float[np.ndarray, "segments hidden"]:
+def _hidden_gaps(
+    problem: Problem, states: Float[np.ndarray, "segments knots states"]
+) -> Float[np.ndarray, "segments hidden"]:
     """Expected minus fitted hidden initial states. They are expected as the segment before ends, or in steady state.
 
     A fitted hidden state depends on the whole segment; if the filter began with it, memory would seem to predict noise.

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.bristle import SETTLING, bristle_rate, kept_within, slip_rate
+from hdjax.effects.bristle import SETTLING, SETTLING_SHARE, bristle_rate, kept_within, slip_rate
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.elementary import power
 from hdjax.parameters import Scalar, parameter
@@ -107,7 +107,10 @@ class Dahl(MeshTorqueEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.3, 1.0, 0.1))
+        return tuple(
+            cls(yield_twist=fraction * scales.x, settling=SETTLING_SHARE * scales.time_step)
+            for fraction in (0.3, 1.0, 0.1)
+        )
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.k * state[0]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.bristle import SETTLING, bristle_rate
+from hdjax.effects.bristle import SETTLING, SETTLING_SHARE, bristle_rate
 from hdjax.effects.dry import load_rate, motor_rate
 from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
 from hdjax.elementary import exponential
@@ -38,7 +38,9 @@ class DahlMotorFriction(MotorSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(bend=bend, settling=scales.time_step) for bend in _bends(scales.omega_m, scales))
+        return tuple(
+            cls(bend=bend, settling=SETTLING_SHARE * scales.time_step) for bend in _bends(scales.omega_m, scales)
+        )
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
@@ -100,7 +102,11 @@ class _LuGre(Effect):
     @classmethod
     def at_rates(cls, rate: float, scales: Scales) -> tuple[Effect, ...]:
         """Proposals (starting values) for a shaft that turns at such rates [rad/s]."""
-        shape = {"omega_s": 0.2 * rate, "tau": 0.3 / scales.natural_frequency, "settling": scales.time_step}
+        shape = {
+            "omega_s": 0.2 * rate,
+            "tau": 0.3 / scales.natural_frequency,
+            "settling": SETTLING_SHARE * scales.time_step,
+        }
         return tuple(cls(bend=bend, **shape) for bend in _bends(rate, scales))
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:

@@ -147,7 +147,9 @@ def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
     model = found.model.with_effects(lag)
     more = fit(model, whole([experiment]), fitted_paths(model), Segmentation(128), start=Start(found.covariance))
     known = measurement_noise(found).covariance
-    before, after = (noise_model(f, known, predictable=RULES.innovations, residual=found.covariance) for f in (found, more))
+    before, after = (
+        noise_model(f, known, predictable=RULES.innovations, residual=found.covariance) for f in (found, more)
+    )
     assert found.objective - more.objective > 0.05 and after.likelihood < before.likelihood
 
 
