@@ -61,8 +61,8 @@ def begin(before: Trial, lead: Lead, study: Study, *, sibling: Trial | None = No
 
 
 def _as_sibling(effect: Effect, before: Trial, sibling: Trial) -> Model | None:
-    """The sibling's model with another form, which takes over what has the same name; None where the sibling replaces an
-    effect of the current model."""
+    """The sibling's model with another form, which takes over the parameters of the same name; None where the sibling
+    replaces an effect of the current model."""
     *others, own = sibling.model.effects
     if [e.name for e in others] != [e.name for e in before.model.effects]:
         return None

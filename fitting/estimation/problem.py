@@ -205,9 +205,9 @@ def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle
 
 def _stable_substeps(model: Model, stretches: Sequence[Stretch]) -> int:
     """Solver steps in a sample interval at which the fastest bristles stay stable."""
-    settling = [float(e.settling) for e in model.effects if hasattr(e, "settling")]
-    longest = _SETTLINGS * min(settling, default=np.inf)
-    return int(np.ceil(stretches[0].experiment.time_step / longest - 1e-9)) if settling else 1
+    settling = [getattr(effect, "settling", np.inf) for effect in model.effects]
+    steps = stretches[0].experiment.time_step / (_SETTLINGS * float(min(settling, default=np.inf)))
+    return max(1, int(np.ceil(steps - 1e-9)))
 
 
 def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:

@@ -146,17 +146,16 @@ def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
     lag = LaggingMeshTorque(k=-1e-4 * rig.K, omega=2.0 * np.pi / (128 * rig.STEP), zeta=0.2, **span)
     model = found.model.with_effects(lag)
     more = fit(model, whole([experiment]), fitted_paths(model), Segmentation(128), start=Start(found.covariance))
-    known = measurement_noise(found).covariance
-    before, after = (
-        noise_model(f, known, predictable=RULES.innovations, residual=found.covariance) for f in (found, more)
-    )
+    known = {"predictable": RULES.innovations, "residual": found.covariance}
+    before, after = (noise_model(f, measurement_noise(found).covariance, **known) for f in (found, more))
+    assert before is not None and after is not None
     assert found.objective - more.objective > 0.05 and after.likelihood < before.likelihood
 
 
 def test_response_to_torque_noise_is_not_assigned_to_the_sensors():
     """Short pieces assign the motor's response to a very noisy torque to the noise of its encoder."""
     found = fitted(noisy_experiment(std=10.0 * STD, count=8000))
-    known = measurement_noise(found).covariance
+    known = {"predictable": RULES.innovations, "residual": found.covariance}
     assert known[0, 0] > 2.0 * OUTPUTS[0, 0]
     seen = _noise_model(found, known)
     assert seen.std == pytest.approx(10.0 * STD, rel=0.05)
