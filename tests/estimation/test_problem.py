@@ -5,10 +5,17 @@ import numpy as np
 
 import rig
 from fitting.estimation.experiment import Stretch, experiment_from_log
-from fitting.estimation.problem import initial_states, short_horizon, states_from, suggested_substeps
+from fitting.estimation.problem import (
+    Segmentation,
+    initial_states,
+    pose,
+    short_horizon,
+    states_from,
+    suggested_substeps,
+)
 from fitting.estimation.segments import cut
 from hdjax.effects.creep import Creep
-from hdjax.effects.hysteresis import BoucWen
+from hdjax.effects.hysteresis import BoucWen, Dahl
 
 
 def whole(*experiments) -> list[Stretch]:
@@ -61,3 +68,11 @@ def test_states_are_transferred_between_models_by_name():
     mixed = np.asarray(states_from(creeping, model, jnp.asarray(states + 1.0)))
     assert creeping.state_names[4:] == ("creep.z", "bouc_wen.z")
     np.testing.assert_array_equal(mixed[:, [0, 1, 2, 3, 5]], states + 1.0)
+
+
+def test_solver_steps_keep_fast_bristles_stable():
+    """Four settling times in a sample interval need two steps, however slow the oscillation is."""
+    stretches = [Stretch(rig.drive_experiment(64), 0, 64)]
+    model = rig.drive_model().with_effects(Dahl(k=1.0, yield_twist=1e-9, settling=0.25 * rig.STEP))
+    assert pose(model, stretches, (), Segmentation(64, substeps=1))[0].substeps == 2
+    assert pose(rig.drive_model(), stretches, (), Segmentation(64, substeps=1))[0].substeps == 1

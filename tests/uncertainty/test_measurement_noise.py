@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import rig
 from fitting.estimation.estimate import Fit, Strategy, fit
-from fitting.estimation.experiment import Stretch
+from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
 from fitting.uncertainty.measurement_noise import _MOTION, measurement_noise
@@ -61,12 +62,22 @@ def test_measurement_noise_is_the_smallest_over_models():
 @pytest.mark.parametrize(("samples", "degree"), [(6, 2), (9, 3), (24, 3)])
 def test_measurement_noise_keeps_coloured_noise(samples: int, degree: int):
     """A polynomial reduces noise with a correlation of 0.5 by less than the factor that is taken for motion."""
-    noise = coloured_noise(np.random.default_rng(0), (20000, samples), correlation=0.5)
+    pushed = np.random.default_rng(0).normal(size=(20000, samples))
+    pushed[:, 1:] *= np.sqrt(1.0 - 0.5**2)
+    noise = lfilter([1.0], [1.0, -0.5], pushed)
     seen = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, samples), 1 + degree))[0]
     left = np.sum((noise - noise @ seen @ seen.T) ** 2) / (samples - degree - 1) / len(noise)
     assert 1.1 < np.sqrt(1.0 / left) < _MOTION
 
 
-def test_measurement_noise_is_found_beside_an_eccentric_encoder():
-    """A sensor's slow error is far above the noise; no initial state describes it, since the twist drives the load."""
-    eccentric = rig.with_effects(LoadEncoderEccentricity.of(1e-3, 0.4))
+def test_measurement_noise_excludes_the_slow_error_of_an_encoder():
+    """No initial state describes a constant error of the load's angle, since the twist drives the load."""
+    torque = rig.drive_torque(2 * COUNT)
+    motion = rig.drive_motion(torque)
+    motion[:, 1] += 100.0 * rig.LOAD_NOISE * np.cos(motion[:, 1])
+    experiment = experiment_from_log(rig.drive_log(motion, torque), hold="zero-order", N=rig.N)
+    model = rig.drive_model()
+    options = {"strategy": Strategy(hold_parameters=True)}
+    found = fit(model, whole([experiment]), base_paths(model), Segmentation(128), **options)
+    assert found.principal_std > 20.0 * rig.LOAD_NOISE
+    assert 0.9 < float(measurement_noise(found).covariance[1, 1]) ** 0.5 / rig.LOAD_NOISE < 2.0
