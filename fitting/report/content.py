@@ -13,7 +13,7 @@ from fitting.outcome import Loop
 from fitting.report.alternatives import alternatives
 from fitting.report.earlier_schema import with_old_names
 from fitting.report.fit_content import fit_dict, meaning
-from fitting.report.intervals import say_what_intervals_hold
+from fitting.report.intervals import say_what_intervals_hold, widen_by_ties
 from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
 from fitting.report.outputs import noise_of_outputs, units_of_outputs
@@ -56,7 +56,10 @@ def report_dict(
     x_max = largest_twist(outcome)
     is_loop = isinstance(outcome, Loop)
     start = None if is_loop else outcome.start
-    after = account_dict(outcome.after, units, x_max) if is_loop else no_account()
+    after = no_account()
+    if isinstance(outcome, Loop):
+        after = account_dict(outcome.after, units, x_max)
+        widen_by_ties(after, outcome, x_max)
     report = {
         "schema": SCHEMA,
         "version": version("hdjax"),

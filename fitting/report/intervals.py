@@ -1,19 +1,65 @@
 """Intervals of parameters under model discrepancy."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from fitting import formatting
 from fitting.attribution.rules import RULES
+from fitting.attribution.selection_round import Round
+from fitting.outcome import Loop
+from fitting.validation.derived_quantities import drive_figures
+from hdjax import Model
 
 NOT_COVERED = "not covered"
 """Flag of a parameter whose interval does not include model discrepancy."""
 _WITHHELD = "withheld"
+_TIED = "The interval includes {name}, which the data do not tell from the form that is named."
 
 
 def is_withheld(estimate: Mapping[str, Any]) -> bool:
     """Whether no interval is stated, because a large discrepancy is not explained."""
     return estimate.get("interval") == _WITHHELD
+
+
+def widen_by_ties(after: dict[str, Any], outcome: Loop, x_max: float) -> None:
+    """Extend the intervals of the drive's parameters and derived figures to all tied forms of an effect's family.
+
+    The data determine the family but not the law, and K depends on it by more than its standard error. Forms of other
+    families may define K in another way; they are told as alternatives.
+
+    Args:
+        after: the final model's content in the report.
+        outcome: of the loop.
+        x_max: the largest measured twist.
+    """
+    names = {f.name for f in outcome.findings}
+    entries = after["parameters"] | after["derived"]
+    for this in outcome.rounds:
+        if not this.accepted or this.winner.name not in names:
+            continue
+        for name, moves in _tied_of_the_family(this, x_max):
+            for path in moves.keys() & entries.keys():
+                entry, move = entries[path], moves[path]
+                low, high = entry["ci95"]
+                entry["ci95"] = [min(low, low + move), max(high, high + move)]
+                if abs(move) > entry["std"]:
+                    entry["note"] = entry.get("note") or _TIED.format(name=name.replace("_", " "))
+
+
+def _tied_of_the_family(this: Round, x_max: float) -> Iterator[tuple[str, dict[str, float]]]:
+    """Name of each tied form of the chosen one's family, and by how much it changes the drive's figures."""
+    chosen = this.winner
+    assert chosen.trial is not None
+    own = _figures(chosen.trial.model, x_max)
+    for verdict in this.verdicts:
+        if verdict.trial is not None and verdict.family == chosen.family and not verdict.separable:
+            theirs = _figures(verdict.trial.model, x_max)
+            yield verdict.name, {path: theirs[path] - own[path] for path in own.keys() & theirs.keys()}
+
+
+def _figures(model: Model, x_max: float) -> dict[str, float]:
+    known = {path: float(value) for path, (value, _) in model.parameters().items() if "." not in path}
+    return known | {name: float(value) for name, (value, _) in drive_figures(model, x_max).items()}
 
 
 def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:

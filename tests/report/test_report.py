@@ -263,3 +263,19 @@ def test_documentation_describes_every_key_of_report_json(kind, request):
     keys |= {key for effect in report["after"]["effects"] for key in effect}
     earlier = {"validation_gain", "validation_rmse", "validation_rmse_of_found", "held_out_rmse", "held_out"}
     assert keys - described - earlier == set()
+
+
+@pytest.mark.parametrize(("family", "moved"), [("motor_friction", 5.0), ("torque_sensor", 0.0)])
+def test_intervals_include_tied_forms_of_the_same_family(loop: Loop, family: str, moved: float):
+    first = loop.rounds[0]
+    trial = first.winner.trial
+    assert trial is not None and first.accepted and first.winner.family == "motor_friction"
+    stiffer = eqx.tree_at(lambda t: t.model, trial, trial.model.replace({"K": trial.model.get("K") + 5.0}))
+    rival = Verdict("stribeck_motor_friction", family, stiffer, first.winner.gain, 0.001, False)
+    tied = eqx.tree_at(lambda o: o.rounds, loop, (dataclasses.replace(first, verdicts=(*first.verdicts, rival)),))
+    one, both = (report_dict(o)["after"] for o in (loop, tied))
+    low, high = one["parameters"]["K"]["ci95"]
+    assert both["parameters"]["K"]["ci95"] == pytest.approx([low, high + moved])
+    assert (both["parameters"]["K"]["note"] is None) == (moved == 0.0)
+    wider = both["derived"]["omega_0"]["ci95"][1] > one["derived"]["omega_0"]["ci95"][1]
+    assert wider == (moved > 0.0)
