@@ -75,7 +75,7 @@ def pose(
     segments, substeps = segmentation.of(stretches), segmentation.substeps
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    substeps = max(substeps, _stable_substeps(model, stretches))
+    substeps = max(substeps, stable_substeps(model, stretches[0].experiment.time_step))
     free = free_parameters(model, paths, typical_scales(model, stretches))
     if states is None:
         states = initial_states(model, segments)
@@ -107,7 +107,7 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
     measured follow from the equations.
     """
     if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:
-        return _with_own_states(model, observed_states(model, segments))
+        return with_hidden_states(model, observed_states(model, segments))
     length = segments.measured.shape[1]
     measured, knots = np.asarray(segments.measured), segments.knots
     step = float(np.median(np.diff(knots)))
@@ -131,10 +131,10 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
         columns += [N * rate[:, 0], rate[:, 0] - rate[:, 1]]
     else:
         columns = [value[:, 0], rate[:, 0]]
-    return _with_own_states(model, np.stack(columns, axis=1))
+    return with_hidden_states(model, np.stack(columns, axis=1))
 
 
-def _with_own_states(
+def with_hidden_states(
     model: Model, motion: Float[np.ndarray, "segments motion_states"]
 ) -> Float[Array, "segments states"]:
     """The mechanical states with hidden states in steady state."""
@@ -156,7 +156,7 @@ def states_from(
     names, states = near.state_names, np.asarray(states)
     if names == model.state_names:
         return jnp.asarray(states)
-    found = at_instants(_settled, (states[:, : len(model.motion_states)], 1), (model, 0))
+    found = np.asarray(with_hidden_states(model, states[:, : len(model.motion_states)]))
     columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
     return jnp.asarray(np.stack(columns, axis=1))
 
@@ -203,10 +203,10 @@ def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle
     return int(np.clip(np.ceil(angle / step_angle), 1, 16))
 
 
-def _stable_substeps(model: Model, stretches: Sequence[Stretch]) -> int:
+def stable_substeps(model: Model, time_step: float) -> int:
     """Solver steps in a sample interval at which the fastest bristles stay stable."""
     settling = [getattr(effect, "settling", np.inf) for effect in model.effects]
-    steps = stretches[0].experiment.time_step / (_SETTLINGS * float(min(settling, default=np.inf)))
+    steps = time_step / (_SETTLINGS * float(min(settling, default=np.inf)))
     return max(1, int(np.ceil(steps - 1e-9)))
 
 

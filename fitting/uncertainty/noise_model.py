@@ -8,8 +8,6 @@ right variances the innovations of a Kalman filter are white, and their likeliho
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import expit
@@ -17,6 +15,7 @@ from scipy.special import expit
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, segments_of_logs
 from fitting.estimation.linear_response import follow
+from fitting.estimation.problem import with_hidden_states
 from fitting.estimation.residual import RUNAWAY, Problem, Unknowns
 from fitting.uncertainty.innovations import SensorNoise, Steps, filtered, spread_evenly, white_noise
 from fitting.uncertainty.input_noise import torque_pushes
@@ -241,7 +240,7 @@ def _hidden_gaps(
     """
     motion = len(problem.model.motion_states)
     begin, before = states[:, 0], np.roll(states[:, -1, motion:], 1, axis=0)
-    settled = np.asarray(jax.vmap(problem.model.settled)(jnp.asarray(begin[:, :motion])))[:, motion:]
+    settled = np.asarray(with_hidden_states(problem.model, begin[:, :motion]))[:, motion:]
     goes_on = np.asarray(problem.segments.goes_on)[:, None]
     return np.where(goes_on, before, settled) - begin[:, motion:]
 

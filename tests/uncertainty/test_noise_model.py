@@ -155,7 +155,7 @@ def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
 def test_response_to_torque_noise_is_not_assigned_to_the_sensors():
     """Short pieces assign the motor's response to a very noisy torque to the noise of its encoder."""
     found = fitted(noisy_experiment(std=10.0 * STD, count=8000))
-    known = {"predictable": RULES.innovations, "residual": found.covariance}
+    known = measurement_noise(found).covariance
     assert known[0, 0] > 2.0 * OUTPUTS[0, 0]
     seen = _noise_model(found, known)
     assert seen.std == pytest.approx(10.0 * STD, rel=0.05)
