@@ -7,7 +7,6 @@ import numpy as np
 from fitting.estimation.engines import linearise, with_engine
 from fitting.estimation.experiment import Experiment, Stretch
 from fitting.estimation.free_parameters import FreeParameters
-from fitting.estimation.problem import stable_substeps
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.segments import cut
 from hdjax import Drive, TwoInertiaModel, sampled
@@ -46,8 +45,7 @@ def outputs_and_slopes(model, torque, start, substeps=1, settled=None):
     free = FreeParameters(paths, (False,) * len(paths), jnp.ones(len(paths)), nothing, nothing)
     states = (model if settled is None else settled).settled(start)[None]
     weights = jnp.eye(2), jnp.ones(len(paths)), jnp.ones(states.shape[1])
-    steps = max(substeps, stable_substeps(model, log.time_step))
-    problem = Problem(model, free, cut([Stretch(log, 0, count)], count), *weights, substeps=steps)
+    problem = Problem(model, free, cut([Stretch(log, 0, count)], count), *weights, substeps=substeps)
     found = linearise(with_engine(problem), Unknowns(free.pack(model), states))
     rows = slice(2 * count)
     slopes = -np.asarray(found.by_parameter)[0, rows].reshape(count, 2, len(paths))
@@ -61,9 +59,9 @@ def outputs(model, torque, start, substeps=1, settled=None):
     return outputs_and_slopes(model, torque, start, substeps, settled)[0]
 
 
-def slopes(model, torque, start):
+def slopes(model, torque, start, substeps=1):
     """Derivative of the outputs with respect to each parameter of the last effect, by dotted path."""
-    return outputs_and_slopes(model, torque, start)[1]
+    return outputs_and_slopes(model, torque, start, substeps)[1]
 
 
 BASE = TwoInertiaModel(DRIVE)
