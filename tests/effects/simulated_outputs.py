@@ -27,12 +27,12 @@ TEMPERATURE = sampled(TIME, 300.0 + 50.0 * TIME, hold="linear")
 START = jnp.asarray([0.3, 0.007, 5.0, 0.2])
 
 
-def outputs_and_slopes(model, torque, start, substeps=1, settled=None):
+def outputs_and_slopes(model, torque, start, substeps=2, settled=None):
     """Outputs of a simulation and their derivatives by each parameter of the last effect, by dotted path.
 
     The drive's states start at `start`. States of effects start where those of the model `settled` are, by default of
     the model itself. It runs by machine code, which agrees with XLA for every form (`test_engine_march.py`) and
-    compiles sooner.
+    compiles sooner. Bristles need two steps in an interval.
     """
     count = torque.knots.size - 1
     warmth = eqx.tree_at(lambda s: s.coefficients, torque, jnp.zeros((count, 1)) + 300.0)
@@ -54,14 +54,14 @@ def outputs_and_slopes(model, torque, start, substeps=1, settled=None):
     )
 
 
-def outputs(model, torque, start, substeps=1, settled=None):
+def outputs(model, torque, start, substeps=2, settled=None):
     """Outputs of a simulation, as in [`outputs_and_slopes`][]."""
     return outputs_and_slopes(model, torque, start, substeps, settled)[0]
 
 
-def slopes(model, torque, start, substeps=1):
+def slopes(model, torque, start):
     """Derivative of the outputs with respect to each parameter of the last effect, by dotted path."""
-    return outputs_and_slopes(model, torque, start, substeps)[1]
+    return outputs_and_slopes(model, torque, start)[1]
 
 
 BASE = TwoInertiaModel(DRIVE)

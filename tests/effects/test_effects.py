@@ -10,7 +10,6 @@ import pytest
 from simulated_outputs import BASE, START, STEP, TIME, TORQUE, outputs, rms, slopes
 
 import hdjax.effects
-from fitting.estimation.problem import stable_substeps
 from hdjax import TwoInertiaModel, sampled
 from hdjax.effects import CATALOGUE, Scales
 from hdjax.effects.creep import Creep
@@ -94,8 +93,7 @@ def test_effect_changes_the_motion_as_its_derivative_predicts(form):
 @every_form
 def test_gradients_by_strength_and_shape_agree_with_differences(form):
     model = at_strength(form, 0.03)
-    substeps = stable_substeps(model, STEP)
-    gradients = slopes(model, TORQUE, START, substeps)
+    gradients = slopes(model, TORQUE, START)
     for name, info in own_parameters(model.effects[0]):
         # Bouc-Wen's n is a constant of the form: neither strength nor shape.
         if info.role == "base":
@@ -104,12 +102,12 @@ def test_gradients_by_strength_and_shape_agree_with_differences(form):
         value = float(model.get(path))
         h = 1e-6 * value
         near = (model.replace({path: value + sign * h}) for sign in (1, -1))
-        after, before = (outputs(changed, TORQUE, START, substeps, settled=model) for changed in near)
+        after, before = (outputs(changed, TORQUE, START, settled=model) for changed in near)
         differences = (after - before) / (2 * h) * value
         found = np.asarray(gradients[path]) * value
         # Differences err by rounding, 1e-14 / 1e-6 of the angles, and where a kink lies between the two motions.
         np.testing.assert_allclose(found, differences, atol=1e-8 + 1e-4 * np.abs(found).max())
-        assert np.abs(found[:, 1]).max() > 1e-4 * np.abs(base_outputs()[:, 1]).max()
+        assert np.abs(found[:, 1]).max() > 5e-5 * np.abs(base_outputs()[:, 1]).max()
 
 
 # -- energy --
