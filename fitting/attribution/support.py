@@ -119,16 +119,19 @@ class Standing:
     @cached_property
     def left(self) -> NoiseModel | None:
         """Fitted noise model of the current model: coloured sensor noise and torque noise; None where it diverges."""
-        return self._noise_of(self.before)
+        return self._noise_of(self.before, self.noise)
 
-    def _noise_of(self, trial: Trial) -> NoiseModel | None:
+    def _noise_of(self, trial: Trial, noise: MeasurementNoise) -> NoiseModel | None:
         known = {"predictable": RULES.innovations, "residual": self.before.training.covariance}
-        return noise_model(trial.training, self.noise.covariance, **known)
+        return noise_model(trial.training, noise.covariance, **known)
 
     def over_noise(self, trial: Trial) -> float:
         """Log likelihood ratio [nats] of a model against the current one, each with its own noise model, minus the
         penalty of its further parameters (Schwarz 1978). Infinite where noise does not explain the current model's
         residual.
+
+        Where the estimate of the measurement noise beside the model is the smaller one, both have that as well: what
+        the current model lacks may have inflated and correlated the other.
 
         Args:
             trial: the model.
@@ -136,11 +139,13 @@ class Standing:
         left = self.left
         if left is None or not is_noise(left):
             return np.inf
-        own = self._noise_of(trial)
-        if own is None:
-            return -np.inf
+        noise = self.noise.and_beside(trial.training)
+        smaller = [] if noise.covariance is self.noise.covariance else [noise]
+        own = [self._noise_of(trial, known) for known in (self.noise, *smaller)]
+        others = [left, *(self._noise_of(self.before, known) for known in smaller)]
         further = len(trial.training.free.paths) - len(self.before.training.free.paths)
-        return own.likelihood - left.likelihood - 0.5 * further * float(np.log(left.count))
+        best, rival = (max((m.likelihood for m in of if m is not None), default=-np.inf) for of in (own, others))
+        return best - rival - 0.5 * further * float(np.log(left.count))
 
 
 def share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:

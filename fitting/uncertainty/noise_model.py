@@ -117,8 +117,11 @@ def _judged(steps: Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoi
     std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
     each = [_size_and_colour(innovations[0, steps.log == log]) for log in range(shares.size)]
     size, colour = np.max(each, axis=0)
-    likelihood, without = -np.sum(0.5 * innovations**2 + logarithms, axis=(1, 2, 3))
-    count = int(steps.counts[steps.lead :].sum()) * innovations.shape[3]
+    samples = int(steps.counts[steps.lead :].sum())
+    # The innovations are those of the independent combinations.
+    units = samples * float(np.linalg.slogdet(sensors.combined)[1])
+    likelihood, without = -np.sum(0.5 * innovations**2 + logarithms, axis=(1, 2, 3)) - units
+    count = samples * innovations.shape[3]
     return NoiseModel(std, share, sensors, float(size), float(colour), float(likelihood), float(without), count)
 
 

@@ -13,8 +13,9 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 import rig
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.rules import RULES
-from fitting.attribution.support import is_noise, noise_of_torque
+from fitting.attribution.support import Standing, is_noise, noise_of_torque
 from fitting.estimation.engines import with_engine
 from fitting.estimation.estimate import Fit, Start, fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, whole
@@ -23,11 +24,11 @@ from fitting.estimation.problem import Segmentation
 from fitting.estimation.residual import Unknowns
 from fitting.loop import close_loop
 from fitting.uncertainty.innovations import SensorNoise, Steps, filtered
-from fitting.uncertainty.measurement_noise import measurement_noise
+from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.uncertainty.noise_model import NoiseModel, noise_model, spread_by_torque
 from fitting.uncertainty.prediction_band import prediction_bands
 from fitting.uncertainty.standard_errors import uncertainty
-from hdjax import Hold
+from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
@@ -150,6 +151,26 @@ def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
     before, after = (noise_model(f, measurement_noise(found).covariance, **known) for f in (found, more))
     assert before is not None and after is not None
     assert found.objective - more.objective > 0.05 and after.likelihood < before.likelihood
+
+
+def test_effect_against_noise_is_judged_alike_with_a_poor_noise_estimate():
+    """What is missing may inflate and correlate the noise that is estimated beside the base model."""
+    torque = rig.drive_torque(4000)
+    motion = rig.drive_motion(torque, state=(0.0, 0.0, 0.3 * rig.N, 0.3))
+    motion[:, 1] += 3e-5 * np.cos(motion[:, 1])
+    experiment = experiment_from_log(rig.drive_log(motion, torque), hold="zero-order", N=rig.N)
+
+    def trial(model: Model) -> Trial:
+        found = fit(model, whole([experiment]), fitted_paths(model), Segmentation(128))
+        return Trial(found.model, found, found, "zero-order")
+
+    before = trial(rig.drive_model())
+    better = trial(rig.drive_model().with_effects(LoadEncoderEccentricity(cosine=3e-5)))
+    poor = OUTPUTS + np.outer([1e-7, 3e-6], [1e-7, 3e-6])
+    good, bad = (
+        Standing(before, before, MeasurementNoise(jnp.asarray(c), ())).over_noise(better) for c in (OUTPUTS, poor)
+    )
+    assert np.isfinite(good) and good > 100.0 and bad == pytest.approx(good, abs=1.0)
 
 
 def test_response_to_torque_noise_is_not_assigned_to_the_sensors():
