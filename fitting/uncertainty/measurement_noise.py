@@ -165,11 +165,11 @@ def _smoothed(problem: Problem, seen: Blocks, piece: int) -> tuple[Float[np.ndar
     rows = np.asarray(seen.residual)[:, : piece * outputs]
     weight = np.asarray(problem.segments.weight)[:, :piece]
     kept = weight.any(axis=1) & (np.abs(rows) < RUNAWAY).all(axis=1)
-    legendre = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, piece), 1 + max(_DEGREES), increasing=True))[0]
+    polynomials = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, piece), 1 + max(_DEGREES), increasing=True))[0]
     by_state = np.asarray(seen.by_state)[kept, : rows.shape[1]]
     measured = np.repeat(weight[kept], outputs, axis=1)
     for degree in _DEGREES:
-        moves = np.kron(legendre[:, : 1 + degree], np.eye(outputs)) * measured[:, :, None]
+        moves = np.kron(polynomials[:, : 1 + degree], np.eye(outputs)) * measured[:, :, None]
         columns = np.concatenate([by_state, moves], axis=2)
         size = np.linalg.norm(columns, axis=1, keepdims=True)
         directions, sizes, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
