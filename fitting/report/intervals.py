@@ -13,7 +13,10 @@ from hdjax import Model
 NOT_COVERED = "not covered"
 """Flag of a parameter whose interval does not include model discrepancy."""
 _WITHHELD = "withheld"
-_TIED = "The interval includes {name}, which the data do not tell from the form that is named."
+_TIED = (
+    "Intervals of the drive's parameters include tied forms of the same family, which change them by more than a "
+    "standard error."
+)
 
 
 def is_withheld(estimate: Mapping[str, Any]) -> bool:
@@ -37,24 +40,24 @@ def widen_by_ties(after: dict[str, Any], outcome: Loop, x_max: float) -> None:
     for this in outcome.rounds:
         if not this.accepted or this.winner.name not in names:
             continue
-        for name, moves in _tied_of_the_family(this, x_max):
+        for moves in _tied_of_the_family(this, x_max):
             for path in moves.keys() & entries.keys():
                 entry, move = entries[path], moves[path]
                 low, high = entry["ci95"]
                 entry["ci95"] = [min(low, low + move), max(high, high + move)]
                 if abs(move) > entry["std"]:
-                    entry["note"] = entry.get("note") or _TIED.format(name=name.replace("_", " "))
+                    entry["note"] = entry.get("note") or _TIED
 
 
-def _tied_of_the_family(this: Round, x_max: float) -> Iterator[tuple[str, dict[str, float]]]:
-    """Name of each tied form of the chosen one's family, and by how much it changes the drive's figures."""
+def _tied_of_the_family(this: Round, x_max: float) -> Iterator[dict[str, float]]:
+    """By how much each tied form of the chosen one's family changes the drive's figures."""
     chosen = this.winner
     assert chosen.trial is not None
     own = _figures(chosen.trial.model, x_max)
     for verdict in this.verdicts:
         if verdict.trial is not None and verdict.family == chosen.family and not verdict.separable:
             theirs = _figures(verdict.trial.model, x_max)
-            yield verdict.name, {path: theirs[path] - own[path] for path in own.keys() & theirs.keys()}
+            yield {path: theirs[path] - own[path] for path in own.keys() & theirs.keys()}
 
 
 def _figures(model: Model, x_max: float) -> dict[str, float]:
