@@ -7,6 +7,7 @@ import numpy as np
 from fitting.estimation.engines import linearise, with_engine
 from fitting.estimation.experiment import Experiment, Stretch
 from fitting.estimation.free_parameters import FreeParameters
+from fitting.estimation.problem import stable_substeps
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.segments import cut
 from hdjax import Drive, TwoInertiaModel, sampled
@@ -27,12 +28,12 @@ TEMPERATURE = sampled(TIME, 300.0 + 50.0 * TIME, hold="linear")
 START = jnp.asarray([0.3, 0.007, 5.0, 0.2])
 
 
-def outputs_and_slopes(model, torque, start, substeps=2, settled=None):
+def outputs_and_slopes(model, torque, start, substeps=None, settled=None):
     """Outputs of a simulation and their derivatives by each parameter of the last effect, by dotted path.
 
     The drive's states start at `start`. States of effects start where those of the model `settled` are, by default of
     the model itself. It runs by machine code, which agrees with XLA for every form (`test_engine_march.py`) and
-    compiles sooner. Bristles need two steps in an interval.
+    compiles sooner. It takes one step in an interval where `substeps` is not given, or as many as bristles need.
     """
     count = torque.knots.size - 1
     warmth = eqx.tree_at(lambda s: s.coefficients, torque, jnp.zeros((count, 1)) + 300.0)
@@ -45,7 +46,8 @@ def outputs_and_slopes(model, torque, start, substeps=2, settled=None):
     free = FreeParameters(paths, (False,) * len(paths), jnp.ones(len(paths)), nothing, nothing)
     states = (model if settled is None else settled).settled(start)[None]
     weights = jnp.eye(2), jnp.ones(len(paths)), jnp.ones(states.shape[1])
-    problem = Problem(model, free, cut([Stretch(log, 0, count)], count), *weights, substeps=substeps)
+    steps = substeps or stable_substeps(model, log.time_step)
+    problem = Problem(model, free, cut([Stretch(log, 0, count)], count), *weights, substeps=steps)
     found = linearise(with_engine(problem), Unknowns(free.pack(model), states))
     rows = slice(2 * count)
     slopes = -np.asarray(found.by_parameter)[0, rows].reshape(count, 2, len(paths))
@@ -54,7 +56,7 @@ def outputs_and_slopes(model, torque, start, substeps=2, settled=None):
     )
 
 
-def outputs(model, torque, start, substeps=2, settled=None):
+def outputs(model, torque, start, substeps=None, settled=None):
     """Outputs of a simulation, as in [`outputs_and_slopes`][]."""
     return outputs_and_slopes(model, torque, start, substeps, settled)[0]
 

@@ -10,6 +10,7 @@ import pytest
 from simulated_outputs import BASE, START, STEP, TIME, TORQUE, outputs, rms, slopes
 
 import hdjax.effects
+from fitting.estimation.problem import stable_substeps
 from hdjax import TwoInertiaModel, sampled
 from hdjax.effects import CATALOGUE, Scales
 from hdjax.effects.creep import Creep
@@ -21,8 +22,8 @@ from hdjax.simulate import march
 
 
 @functools.cache
-def base_outputs():
-    return np.asarray(outputs(BASE, TORQUE, START))
+def base_outputs(substeps=1):
+    return np.asarray(outputs(BASE, TORQUE, START, substeps))
 
 
 @functools.cache
@@ -75,9 +76,11 @@ DELAYED = ("input_delay", "input_lag", "motor_encoder_delay")
 @every_form
 def test_effect_of_zero_strength_is_the_base_model(form):
     for effect in form.proposals(scales()):
-        found = np.asarray(outputs(BASE.with_effects(effect), TORQUE, START))
+        model = BASE.with_effects(effect)
+        base = base_outputs(stable_substeps(model, STEP))
+        found = np.asarray(outputs(model, TORQUE, START))
         # Rounding over 200 steps; a delayed torque is late by 1e-9 of a step, which changes the twist by as much.
-        error = np.abs(found - base_outputs()).max(axis=0) / np.abs(base_outputs()).max(axis=0)
+        error = np.abs(found - base).max(axis=0) / np.abs(base).max(axis=0)
         assert error.max() < (1e-8 if form.name in DELAYED else 1e-12)
 
 
@@ -107,7 +110,7 @@ def test_gradients_by_strength_and_shape_agree_with_differences(form):
         found = np.asarray(gradients[path]) * value
         # Differences err by rounding, 1e-14 / 1e-6 of the angles, and where a kink lies between the two motions.
         np.testing.assert_allclose(found, differences, atol=1e-8 + 1e-4 * np.abs(found).max())
-        assert np.abs(found[:, 1]).max() > 5e-5 * np.abs(base_outputs()[:, 1]).max()
+        assert np.abs(found[:, 1]).max() > 1e-4 * np.abs(base_outputs()[:, 1]).max()
 
 
 # -- energy --
