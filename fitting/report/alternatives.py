@@ -5,7 +5,7 @@ from typing import Any
 
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.selection_round import Verdict
-from fitting.report.outcome import Outcome
+from fitting.report.outcome import Outcome, kept_rounds
 from fitting.report.separating import separating_experiment
 
 
@@ -14,9 +14,7 @@ def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
     names = {f.name for f in outcome.findings}
     families = {f.family for f in outcome.findings}
     found: dict[str, dict[str, Any]] = {}
-    for this in outcome.rounds:
-        if not this.accepted or this.winner.name not in names:
-            continue
+    for this in kept_rounds(outcome):
         for verdict in this.verdicts:
             if verdict.trial is None or verdict.name in names or (verdict.family in families and verdict.separable):
                 continue

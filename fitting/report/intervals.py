@@ -7,6 +7,7 @@ from fitting import formatting
 from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round
 from fitting.outcome import Loop
+from fitting.report.outcome import kept_rounds
 from fitting.validation.derived_quantities import drive_figures
 from hdjax import Model
 
@@ -35,11 +36,8 @@ def widen_by_ties(after: dict[str, Any], outcome: Loop, x_max: float) -> None:
         outcome: of the loop.
         x_max: the largest measured twist.
     """
-    names = {f.name for f in outcome.findings}
     entries = after["parameters"] | after["derived"]
-    for this in outcome.rounds:
-        if not this.accepted or this.winner.name not in names:
-            continue
+    for this in kept_rounds(outcome):
         for moves in _tied_of_the_family(this, x_max):
             for path in moves.keys() & entries.keys():
                 entry, move = entries[path], moves[path]
