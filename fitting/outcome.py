@@ -169,3 +169,9 @@ class Loop(eqx.Module):
         """Largest residual of an output over short segments of the selection data with the final model, over the
         measurement noise. Torque noise does not count."""
         return 1.0 if self.torque_noise is not None else max(self.left)
+
+
+def kept_rounds(outcome: Loop | FitOnly) -> list[Round]:
+    """Rounds of the search whose effect is still in the final model."""
+    names = {f.name for f in outcome.findings}
+    return [this for this in outcome.rounds if this.accepted and this.winner.name in names]

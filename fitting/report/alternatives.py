@@ -5,7 +5,8 @@ from typing import Any
 
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.selection_round import Verdict
-from fitting.report.outcome import Outcome, kept_rounds
+from fitting.outcome import kept_rounds
+from fitting.report.outcome import Outcome
 from fitting.report.separating import separating_experiment
 
 

@@ -6,8 +6,7 @@ from typing import Any
 from fitting import formatting
 from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round
-from fitting.outcome import Loop
-from fitting.report.outcome import kept_rounds
+from fitting.outcome import Loop, kept_rounds
 from fitting.validation.derived_quantities import drive_figures
 from hdjax import Model
 
