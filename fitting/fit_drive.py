@@ -1,6 +1,6 @@
 """A fit without a search for effects, with all its diagnostics."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_he
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
+from fitting.estimation.one_side import SIDES
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
-from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import FitOnly
 from fitting.progress import Progress, silent
@@ -57,8 +57,12 @@ def fit_only(
     clock.lap("measurement noise")
     progress("final fit over long horizons")
     fixed_by = fit_behind_fixed_values(base)
-    by_friction = fixed_by is not None and not sees_twist(base.stretches)
-    base, assumed = (base, {}) if fixed_by is None or by_friction else _without_priors(base)
+    source, assumed = "torque", {}
+    if fixed_by is not None and isinstance(fixed_by.model, SIDES):
+        source = f"{fixed_by.model.equation} equation"
+        base, assumed = _without_priors(base, fixed_by.model.scaled_by)
+    elif fixed_by is not None:
+        source = "torque beside friction"
     found = base if is_held(base) else long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs")
@@ -89,8 +93,7 @@ def fit_only(
         bands=bands,
         posterior=draws,
         seconds=clock.laps,
-        by_load=fixed_by is not None and not by_friction,
-        by_friction=by_friction,
+        parameters_from=source,
         assumed=assumed,
     )
 
@@ -113,11 +116,11 @@ def _base(
     return hold, base_fit(model, whole(experiments[hold])), experiments, test
 
 
-def _without_priors(base: Fit) -> tuple[Fit, dict[str, float]]:
+def _without_priors(base: Fit, scaled_by: Collection[str]) -> tuple[Fit, dict[str, float]]:
     """A base fit whose torque does not explain the motion, with inertias and torque constant fixed, since they are not
-    identifiable then; and the value of an unknown inertia in the load's equation."""
+    identifiable then; and the value of an unknown inertia in the equation that determines the parameters."""
     if not isinstance(base.model, TwoInertiaModel) or not base.model.drive.priors:
         return base, {}
-    unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path == "J_l"]
+    unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path in scaled_by]
     assumed = {path: float(base.model.get(path)) for path in unknown}
     return base_fit(with_priors(base.model, ()), base.stretches), assumed

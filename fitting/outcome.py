@@ -58,11 +58,10 @@ class FitOnly(eqx.Module):
         bands: prediction bands of the free runs, along test data where there are any.
         posterior: draws, if requested.
         seconds: time by stage.
-        by_load: whether K, alpha and B_sp are those of the load's equation, see [`fitting.estimation.motor_driven`][],
-            since the torque does not explain the motion.
-        by_friction: whether all parameters are those of a fit with friction of the motor, see
-            [`fitting.estimation.beside_friction`][], for the same reason, if the load was not measured.
-        assumed: value of an unknown inertia in the load's equation, if `by_load`.
+        parameters_from: "torque"; where that does not explain the motion, the "load equation" or "motor equation" for
+            K, alpha and B_sp (see [`fitting.estimation.one_side`][]), or, if the load was not measured, "torque beside
+            friction" of the motor for all parameters (see [`fitting.estimation.beside_friction`][]).
+        assumed: value of an unknown inertia in one side's equation, if the parameters are from it.
     """
 
     account: Account
@@ -76,8 +75,7 @@ class FitOnly(eqx.Module):
     bands: tuple[PredictionBand, ...]
     posterior: Posterior | None
     seconds: dict[str, float]
-    by_load: bool = eqx.field(static=True)
-    by_friction: bool = eqx.field(static=True)
+    parameters_from: str = eqx.field(static=True)
     assumed: dict[str, float]
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()

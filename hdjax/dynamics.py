@@ -317,7 +317,14 @@ class MotorDrivenModel(TwistModel):
         x'' = theta_m''/N - (tau + T_l)/J_l
 
     The motor's acceleration over N [rad/s^2] takes the place of the torque. States: x, v.
+
+    Attributes:
+        equation: the side whose equation of motion it is.
+        scaled_by: parameters of the drive that K and B_sp are in proportion to.
     """
+
+    equation: ClassVar[str] = "load"
+    scaled_by: ClassVar[tuple[str, ...]] = ("J_l",)
 
     drive: Drive
     effects: tuple[Effect, ...] = ()
@@ -332,3 +339,30 @@ class MotorDrivenModel(TwistModel):
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0 / self.drive.J_l
+
+
+class LoadDrivenModel(TwistModel):
+    """The motor behind the mesh for a given motion of the load.
+
+        x'' = (k_T T_m - tau/N)/(N J_m) - theta_l''
+
+    The load's acceleration [rad/s^2] takes the place of the load torque. States: x, v. Attributes as in
+    [`MotorDrivenModel`][].
+    """
+
+    equation: ClassVar[str] = "motor"
+    scaled_by: ClassVar[tuple[str, ...]] = ("J_m", "k_T")
+
+    drive: Drive
+    effects: tuple[Effect, ...] = ()
+
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
+        motion = self.motion(state, conditions)
+        own = self._own_states(state)
+        turning = (self.drive.k_T * torque - self._mesh_torque(motion, own) / self.drive.N) / self.drive.J_m
+        return self._with_own_rates(motion, [state[1], turning / self.drive.N - load_torque], own)
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        return 1.0 / (self.drive.J_m * self.drive.N**2)

@@ -20,7 +20,7 @@ from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.late_readings import with_load_moved
-from fitting.estimation.motor_driven import held_at, motor_driven_fit
+from fitting.estimation.one_side import SIDES, fit_of_side, held_at, one_side_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.scales import largest_torque
@@ -134,7 +134,7 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     best, begun = fitted(starts[0]), starts[0]
     if leaves_white_noise(best):
         return best, begun
-    driven = motor_driven_fit(best.model, training) if isinstance(best.model, TwoInertiaModel) else None
+    driven = one_side_fit(best.model, training) if isinstance(best.model, TwoInertiaModel) else None
     if _contradicts(driven, best):
         return _held_at(driven, best.model, training, halo), begun
     trials = [(fitted(s, strategy=Strategy(_TRIAL_STEPS)), s) for s in starts[1:]]
@@ -194,10 +194,10 @@ def _with_inertias_free(found: Fit, priors: tuple[Prior, ...]) -> Fit:
 
 
 def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
-    """Whether the load's own equation, which holds whatever acts on the motor, contradicts a fit of the drive.
+    """Whether one side's own equation, which holds whatever acts on the other, contradicts a fit of the drive.
 
-    Large friction makes the motor move far less than the base model predicts. In that model only the mesh can dissipate
-    the motor's energy. So the fit raises B_sp until the twist vanishes and K has no influence.
+    Large friction makes a side move far less than the base model predicts. In that model only the mesh can dissipate
+    the energy. So the fit raises B_sp until the twist vanishes and K has no influence.
     """
     if driven is None:
         return False
@@ -205,7 +205,7 @@ def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
 
 
 def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:
-    """The base model with its parameters fixed at estimates from the load's equation of motion."""
+    """The base model with its parameters fixed at estimates from one side's equation of motion."""
     told = model.replace({path: driven.model.get(path) for path in MESH})
     horizon = short_horizon(told, training)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
@@ -238,18 +238,20 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
 
 
 def fit_behind_fixed_values(found: Fit) -> Fit | None:
-    """The fit that supplied a base fit's fixed values: of the load's equation, or beside motor friction. None where
+    """The fit that supplied a base fit's fixed values: of one side's equation, or beside motor friction. None where
     nothing was fixed, or by other means."""
     if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
         return None
     if not sees_twist(found.stretches):
         return refitted_beside(found)
-    driven = motor_driven_fit(with_priors(found.model, ()), found.stretches)
+    driven = one_side_fit(with_priors(found.model, ()), found.stretches)
     if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
         return None
-    # The fit determines the stiffness only in proportion to the load's inertia.
-    known = tuple(p for p in found.model.drive.priors if p.path == "J_l" and np.isfinite(p.tolerance))
-    return motor_driven_fit(with_priors(found.model, known), found.stretches) if known else driven
+    # The fit determines the stiffness only in proportion to that side's inertia.
+    side = type(driven.model)
+    assert issubclass(side, SIDES)
+    known = tuple(p for p in found.model.drive.priors if p.path in side.scaled_by and np.isfinite(p.tolerance))
+    return fit_of_side(side, with_priors(found.model, known), found.stretches) if known else driven
 
 
 def need_double_precision() -> None:

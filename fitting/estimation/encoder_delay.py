@@ -1,9 +1,11 @@
-"""Delay between the encoders, in whole rows, by the load's equation of motion in weak form.
+"""Delay between the encoders, in whole rows, by both sides' equations of motion in weak form.
 
     J_l theta_l'' = K f(x) + B_sp x' + T_l - friction of the load,    x = theta_m/N - theta_l
+    k_T T_m = J_m theta_m'' + (K f(x) + B_sp x')/N + friction of the motor
 
-is linear in the unknowns for a given delay. It holds whatever acts on the motor. A wrong delay leaves much of it
-unexplained: near the resonance the load does not follow the motor, so that nothing else shifts their phase alike.
+are linear in the unknowns for a given delay. The first holds whatever acts on the motor, the second whatever acts on
+the load. A wrong delay leaves much of either unexplained: near the resonance the load does not follow the motor, so
+that nothing else shifts their phase alike.
 """
 
 import itertools
@@ -30,7 +32,7 @@ _APART = 4
 
 def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     """Whole rows by which the load's readings are later than the motor's [s], negative where they are earlier. Zero
-    where no delay explains the load's motion far better, or the twist was not measured.
+    where no delay explains the motion far better, or the twist was not measured.
 
     Args:
         model: supplies the load's inertia.
@@ -42,40 +44,61 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     most = int(min(LONGEST_DELAY / step, _MOST_ROWS))
     parts = [_signals(stretch) for stretch in stretches]
 
-    def left(row: int, width: int) -> float:
-        return _unexplained(model, parts, width, step, row, most)
+    def left(row: int, width: int, side: str = "load") -> float:
+        return _unexplained(model, parts, width, step, row, most, side)
 
     coarse = range(-(most // _APART) * _APART, most + 1, _APART)
     near, width = min(itertools.product(coarse, WIDTHS), key=lambda pair: left(*pair))
     close = range(max(near - _APART, -most), min(near + _APART, most) + 1)
     row = min(close, key=lambda row: left(row, width))
-    return row * step if left(row, width) < _LEFT**2 * left(0, width) else 0.0
+    if not left(row, width) < _LEFT**2 * left(0, width):
+        return 0.0
+    # Friction with a memory shifts the load's phase as well; the motor's equation does not contain it. The likelihood
+    # of two equations with unknown noise depends on the product of their errors.
+    both = [left(r, width) * left(r, width, "motor") for r in (row, 0)]
+    return row * step if both[0] < _LEFT**2 * both[1] else 0.0
 
 
-def _signals(stretch: Stretch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turn of the motor over N, load angle [rad], and logged torque on the load [N m], of the first samples."""
+def _signals(stretch: Stretch) -> tuple[np.ndarray, ...]:
+    """Turn of the motor over N, load angle [rad], logged torques of the motor and on the load [N m], of the first
+    samples."""
     experiment, part = stretch.experiment, slice(stretch.start, min(stretch.stop, stretch.start + _ENOUGH))
     turn, x = experiment.measured[part, 0], experiment.measured[part, -1]
     load = experiment.load_torque
     T_l = np.zeros(x.size) if load is None else np.asarray(load.coefficients)[part, 0]
-    return turn - turn[0], turn - x - (turn - x)[0], T_l
+    return turn - turn[0], turn - x - (turn - x)[0], np.asarray(experiment.torque.coefficients)[part, 0], T_l
 
 
 def _unexplained(
-    model: TwoInertiaModel, parts: Sequence[tuple[np.ndarray, ...]], width: int, step: float, row: int, most: int
+    model: TwoInertiaModel,
+    parts: Sequence[tuple[np.ndarray, ...]],
+    width: int,
+    step: float,
+    row: int,
+    most: int,
+    side: str,
 ) -> float:
-    """Unexplained share of the load's mean square acceleration, if its readings are `row` rows late."""
+    """Unexplained share of the load's mean square acceleration, or of the motor's mean square torque, if the load's
+    readings are `row` rows late."""
     tests, slopes, curvatures = blind_functions(width, step)
     rows, hop = [], max(1, width // 4)
-    for turn, angle, T_l in parts:
+    for turn, angle, T_m, T_l in parts:
         inner = slice(most, turn.size - most)
         if turn.size < 2 * most + 3 * width:
             continue
         load, x = np.roll(angle, -row)[inner], (turn - np.roll(angle, -row))[inner]
-        terms = [(x, tests), (x**3, tests), (x, slopes), (load, slopes), (np.sign(np.gradient(load)), tests)]
-        right = [(float(model.drive.J_l) * load, curvatures), (-T_l[inner], tests)]
-        columns = [weak_form.against(signal, functions, hop) for signal, functions in (*terms, *right)]
-        rows.append(np.stack([*columns[:5], columns[5] + columns[6]], axis=1))
+        if side == "load":
+            shaft, others = load, []
+            right = [(float(model.drive.J_l) * load, curvatures), (-T_l[inner], tests)]
+        else:
+            shaft, others = turn[inner], [(turn[inner], curvatures)]
+            right = [(T_m[inner], tests)]
+        friction = [(shaft, slopes), (np.sign(np.gradient(shaft)), tests)]
+        terms = [(x, tests), (x**3, tests), (x, slopes), *friction, *others]
+        columns = [
+            [weak_form.against(signal, functions, hop) for signal, functions in pairs] for pairs in (terms, right)
+        ]
+        rows.append(np.stack([*columns[0], sum(columns[1])], axis=1))
     if not rows:
         return 1.0
     matrix = np.concatenate(rows)

@@ -67,10 +67,10 @@ def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[M
     return _distinct(model, _estimates(model, stretches, blind=True))
 
 
-def starts_of_load_equation(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
-    """Starting values from the load's equation, which holds whatever acts on the motor; may be empty. Arguments as in
-    [`starting_models`][]."""
-    found = (_estimates(model, stretches, blind=blind, equations=("load",)) for blind in (False, True))
+def starts_of_equation(side: str, model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Starting values from the equation of "load" or "motor", which holds whatever acts on the other side; may be
+    empty. Other arguments as in [`starting_models`][]."""
+    found = (_estimates(model, stretches, blind=blind, equations=(side,)) for blind in (False, True))
     return _distinct(model, list(itertools.chain(*found)))
 
 
@@ -207,7 +207,7 @@ def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], eq
         return {"omega_0": omega_0, "alpha": alpha, "mu": mu, "gain": solution[3]}
     drive = model.drive
     assert isinstance(drive, Drive)
-    inertia = 1.0 if equation == "load" else float(drive.c)
+    inertia = float(drive.c) if equation == "error" else 1.0
     K = stiffness / inertia
     least = 2e-3 * np.sqrt(K / float(drive.c))
     return {"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)}
@@ -229,12 +229,16 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: b
         return weak_form.against(signal, functions, hop) * dt
 
     spring, cubic, damper = against(x, tests), against(x**3, tests), -against(x, slopes)
-    if equation == "load":
+    if equation != "error":
         drive = model.drive
         assert isinstance(drive, Drive)
-        theta_l = experiment.measured[part, 0] - x
-        theta_l = theta_l - theta_l[0]
-        right = float(drive.J_l) * against(theta_l, curvatures) - against(T_l, tests)
+        turn = experiment.measured[part, 0]
+        N, angle = float(drive.N), turn - x if equation == "load" else turn
+        momentum = against(angle - angle[0], curvatures)
+        if equation == "load":
+            right = float(drive.J_l) * momentum - against(T_l, tests)
+        else:
+            right = N * float(drive.k_T) * against(u, tests) - N**2 * float(drive.J_m) * momentum
         return np.stack([spring, cubic, damper], axis=1), right
     right = -against(x, curvatures)
     if isinstance(model.drive, Drive):

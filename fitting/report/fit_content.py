@@ -34,7 +34,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     """
     g, account = fitted.goodness, fitted.account
     return {
-        "parameters_from": _parameters_from(fitted),
+        "parameters_from": fitted.parameters_from,
         "assumed": dict(fitted.assumed),
         "goodness": {
             "fit_percent": dict(g.fit_percent),
@@ -68,34 +68,27 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     }
 
 
-def _parameters_from(fitted: FitOnly) -> str:
-    """The equation that determines the parameters."""
-    if fitted.by_friction:
-        return "torque beside friction"
-    return "load equation" if fitted.by_load else "torque"
-
-
 def meaning(report: Mapping[str, Any]) -> list[str]:
     """Interpretation of a fit's report, most important first, in a sentence or two each."""
     verdicts = {t["name"].split(" of ")[0]: t["verdict"] for t in report["residual_tests"]}
     on = report["judged_on"]
     rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"][on]
     notes = []
-    by_load = report["parameters_from"] != "torque"
-    if report["parameters_from"] == "torque beside friction":
+    source = report["parameters_from"]
+    if source == "torque beside friction":
         notes.append(
             "The motor does not move as the logged torque predicts: friction or another torque of that size acts on "
             "it. "
             "The parameters are therefore those of a fit with Coulomb and viscous friction on the motor. The errors "
             "below are those of free runs without friction. `hdjax close-loop` searches for what acts on the motor."
         )
-    elif by_load:
+    elif source != "torque":
+        side, other = ("load", "motor") if source == "load equation" else ("motor", "load")
         notes.append(
-            "The motor does not move as the logged torque predicts: friction or another torque of that size acts on "
-            "it. K, "
-            "alpha and B_sp are therefore those of the load's own equation, driven by the motor's motion as measured. "
-            "The errors below are those of free runs under the torque. `hdjax close-loop` searches for what acts on "
-            "the motor."
+            f"The {other} does not move as the logged torque predicts: friction or another torque of that size acts on "
+            f"it. K, alpha and B_sp are therefore those of the {side}'s own equation, driven by the {other}'s motion "
+            "as measured. The errors below are those of free runs under the torque. `hdjax close-loop` searches for "
+            f"what acts on the {other}."
         )
     for path, value in report["assumed"].items():
         notes.append(
@@ -107,7 +100,7 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
     missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
     if over_noise is None:
         notes.append(f"The free run diverges on {on} data: the model does not describe this drive.")
-    elif missing and not by_load:
+    elif missing and source == "torque":
         notes.append(
             "The residual is not white noise: the model lacks something, or the sensors' noise is coloured. The "
             "parameters absorb a part of what is missing, so that true values may lie outside the intervals. `hdjax "

@@ -12,11 +12,11 @@ import joints
 from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
-from fitting.estimation.motor_driven import held_at, motor_driven_fit
+from fitting.estimation.one_side import fit_of_side, held_at
 from fitting.fit_drive import fit_only
 from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
-from hdjax import Drive, TwoInertiaModel
+from hdjax import Drive, MotorDrivenModel, TwoInertiaModel
 
 SMOOTH = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
 WITH_FRICTION = joints.with_friction(SMOOTH, 0.5, 0.4)
@@ -37,7 +37,7 @@ def stretches() -> tuple[Stretch, ...]:
 
 
 def test_motor_driven_fit_recovers_stiffness_under_motor_friction(stretches):
-    found = motor_driven_fit(model_of(WITH_FRICTION), stretches)
+    found = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches)
     assert found is not None
     for path, estimate in uncertainty(found).estimates.items():
         truth = getattr(WITH_FRICTION, path)
@@ -47,7 +47,7 @@ def test_motor_driven_fit_recovers_stiffness_under_motor_friction(stretches):
 
 def test_motor_driven_fit_does_not_depend_on_the_motor_torque(stretches):
     other = stretches_of(WITH_FRICTION, motor_torque=np.sin(np.arange(joints.COUNT)))
-    one, two = (motor_driven_fit(model_of(WITH_FRICTION), s) for s in (stretches, other))
+    one, two = (fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), s) for s in (stretches, other))
     assert one is not None and two is not None
     assert [float(one.model.get(p)) for p in base_paths(one.model)] == [
         float(two.model.get(p)) for p in base_paths(two.model)
@@ -57,14 +57,14 @@ def test_motor_driven_fit_does_not_depend_on_the_motor_torque(stretches):
 def test_motor_driven_fit_includes_the_logged_load_torque():
     """A logged load torque that did not act enters the equation and makes the fit worse."""
     pushed = np.full(joints.COUNT, 0.05 * WITH_FRICTION.K * 1e-2)
-    with_load = motor_driven_fit(model_of(WITH_FRICTION), stretches_of(WITH_FRICTION, load_torque=pushed))
-    without = motor_driven_fit(model_of(WITH_FRICTION), stretches_of(WITH_FRICTION))
+    with_load = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches_of(WITH_FRICTION, load_torque=pushed))
+    without = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches_of(WITH_FRICTION))
     assert with_load is not None and without is not None
     assert with_load.principal_std > 3.0 * without.principal_std
 
 
 def test_motor_driven_residual_grows_with_a_wrong_stiffness(stretches):
-    found = motor_driven_fit(model_of(WITH_FRICTION), stretches)
+    found = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches)
     assert found is not None
     off = held_at(model_of(WITH_FRICTION).replace({"K": 2.0 * WITH_FRICTION.K}), found)
     assert off.objective > found.objective + np.log(2.0)
