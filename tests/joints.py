@@ -1,4 +1,4 @@
-"""Random joints of realistic parameters: two inertias on a mesh, with friction on the motor.
+"""Random joints of realistic parameters: two inertias on a mesh, with friction on the motor or the load.
 
 The equations of motion are written independently in numpy (DESIGN 2.1), without hdjax' simulator.
 """
@@ -29,6 +29,8 @@ class Joint:
         coulomb: friction on the motor [N m].
         viscous: likewise [N m s/rad].
         rms: of the motor torque [N m].
+        load_friction: Coulomb torque on the load [N m], which builds up over `bend` (Dahl).
+        bend: load angle [rad].
     """
 
     N: float
@@ -40,6 +42,8 @@ class Joint:
     coulomb: float = 0.0
     viscous: float = 0.0
     rms: float = 1.0
+    load_friction: float = 0.0
+    bend: float = 1e-3
 
     @property
     def omega_0(self) -> float:
@@ -59,13 +63,15 @@ def motion_of(joint: Joint, torque: np.ndarray, *, step: float = STEP, substeps:
     rest, width = 1e-3 * joint.rms / (joint.J_m * joint.omega_0), joint.N
 
     def rates(y, T):
-        theta_m, theta_l, omega_m, omega_l = y
+        theta_m, theta_l, omega_m, omega_l, z = y
         x, v = theta_m / width - theta_l, omega_m / width - omega_l
         tau = joint.K * (x + joint.alpha * x**3) + joint.B_sp * v
         friction = joint.coulomb * np.tanh(omega_m / rest) + joint.viscous * omega_m
-        return omega_m, omega_l, (T - friction - tau / width) / joint.J_m, tau / joint.J_l
+        held = joint.load_friction * z / joint.bend
+        sliding = omega_l - abs(omega_l) * z / joint.bend
+        return omega_m, omega_l, (T - friction - tau / width) / joint.J_m, (tau - held) / joint.J_l, sliding
 
-    return rig.rk4(rates, (0.0,) * 4, torque, step, substeps)
+    return rig.rk4(rates, (0.0,) * 5, torque, step, substeps)[:, :4]
 
 
 def with_friction(joint: Joint, coulomb: float, viscous: float, *, seed: int = 0) -> Joint:

@@ -53,10 +53,10 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     row = min(close, key=lambda row: left(row, width))
     if not left(row, width) < _LEFT**2 * left(0, width):
         return 0.0
-    # Friction with a memory shifts the load's phase as well; the motor's equation does not contain it. The likelihood
-    # of two equations with unknown noise depends on the product of their errors.
-    both = [left(r, width) * left(r, width, "motor") for r in (row, 0)]
-    return row * step if both[0] < _LEFT**2 * both[1] else 0.0
+    # Friction of the load with a memory shifts its phase as well, over wide test functions alone, and the motor's
+    # equation does not contain it. The likelihood depends on the product of all errors, where each has its own noise.
+    falls = [left(row, *how) / max(left(0, *how), 1e-300) for how in itertools.product(WIDTHS, ("load", "motor"))]
+    return row * step if np.prod(falls) < _LEFT**2 else 0.0
 
 
 def _signals(stretch: Stretch) -> tuple[np.ndarray, ...]:

@@ -16,6 +16,9 @@ from hdjax.parameters import Scalar, parameter
 SOURCE = "Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
 # Bend of the bristles over the shaft's motion in a radian of a period: from well resolved to nearly Coulomb.
 _BENDS = (0.1, 0.02, 0.5)
+# Stribeck rates: as a share of the shaft's, and at the output [rad/s], from the upper part of EFFECTS' 1e-3 to 0.1.
+# From below, the excess grows without limit in place of the rate.
+_SHARE_OF_RATE, _AT_OUTPUT = 0.2, (0.1, 0.03)
 
 
 class DahlMotorFriction(MotorSideEffect):
@@ -100,14 +103,11 @@ class _LuGre(Effect):
         """The shaft's rate."""
 
     @classmethod
-    def at_rates(cls, rate: float, scales: Scales) -> tuple[Effect, ...]:
-        """Proposals (starting values) for a shaft that turns at such rates [rad/s]."""
-        shape = {
-            "omega_s": 0.2 * rate,
-            "tau": 0.3 / scales.natural_frequency,
-            "settling": SETTLING_SHARE * scales.time_step,
-        }
-        return tuple(cls(bend=bend, **shape) for bend in _bends(rate, scales))
+    def at_rates(cls, rate: float, ratio: float, scales: Scales) -> tuple[Effect, ...]:
+        """Proposals (starting values) for a shaft that turns at such rates [rad/s], `ratio` times the output's."""
+        shape = {"tau": 0.3 / scales.natural_frequency, "settling": SETTLING_SHARE * scales.time_step}
+        slow = (_SHARE_OF_RATE * rate, *(ratio * omega_s for omega_s in _AT_OUTPUT))
+        return tuple(cls(bend=bend, omega_s=omega_s, **shape) for omega_s in slow for bend in _bends(rate, scales))
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         (slipping,) = self.state_rates(motion, state)
@@ -146,7 +146,7 @@ class LuGreMotorFriction(_LuGre, MotorSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return cls.at_rates(scales.omega_m, scales)
+        return cls.at_rates(scales.omega_m, scales.reduction_ratio, scales)
 
     @staticmethod
     def rate_of(motion: Motion) -> Array:
@@ -165,7 +165,7 @@ class LuGreLoadFriction(_LuGre, LoadSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return cls.at_rates(scales.omega_l, scales)
+        return cls.at_rates(scales.omega_l, 1.0, scales)
 
     @staticmethod
     def rate_of(motion: Motion) -> Array:

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import joints
 import rig
 from fitting.estimation.encoder_delay import delay_of_load
-from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log, whole
 from fitting.estimation.late_readings import aligned, is_aligned, unaligned, with_load_moved
-from hdjax import TwoInertiaModel
+from hdjax import Drive, TwoInertiaModel
 from hdjax.effects.sensing import EncoderDelay, LoadEncoderDelay, MotorEncoderDelay
 
 COUNT = 1500
@@ -40,6 +41,17 @@ def test_whole_rows_between_the_encoders_are_found_beside_any_effect(beside: str
     found = delay_of_load(MODEL, (Stretch(late, 20, COUNT - 20),)) / rig.STEP
     off = 1 if rows and beside in ("kinematic error", "backlash") else 0
     assert abs(found - rows) < off + 1e-6
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8, 1.5])
+def test_friction_of_the_load_with_a_memory_is_no_delay(share: float):
+    """It shifts the load's phase, but the motor's equation does not contain it."""
+    joint = joints.Joint(N=50.0, J_m=7.2e-5, J_l=0.03, K=630.0, B_sp=0.09, rms=0.06)
+    torque = share * joint.rms * joint.N
+    joint = replace(joint, load_friction=torque, bend=torque / (0.5 * joint.K))
+    model = TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=1.0))
+    experiment = experiment_from_log(joints.log_of(joint), hold="zero-order", N=joint.N)
+    assert delay_of_load(model, whole([experiment])) == 0.0
 
 
 def test_delay_is_not_looked_for_where_the_twist_was_not_measured():

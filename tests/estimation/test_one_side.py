@@ -1,6 +1,6 @@
-"""The load's own equation determines K whatever acts on the motor.
+"""The load's own equation determines K whatever acts on the motor, the motor's whatever acts on the load.
 
-The base fit fixes K at that value where the torque misleads.
+The base fit fixes K at that value where the other side does not move as the torque says.
 """
 
 import dataclasses
@@ -16,10 +16,13 @@ from fitting.estimation.one_side import fit_of_side, held_at
 from fitting.fit_drive import fit_only
 from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
-from hdjax import Drive, MotorDrivenModel, TwoInertiaModel
+from hdjax import Drive, LoadDrivenModel, MotorDrivenModel, TwoInertiaModel
 
 SMOOTH = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
 WITH_FRICTION = joints.with_friction(SMOOTH, 0.5, 0.4)
+
+
+WITH_LOAD_FRICTION = dataclasses.replace(SMOOTH, load_friction=1.2 * SMOOTH.rms * SMOOTH.N, bend=3e-3)
 
 
 def model_of(joint: joints.Joint) -> TwoInertiaModel:
@@ -91,3 +94,32 @@ def test_report_states_intervals_from_the_load_equation(stretches):
     low, high = stiffness["ci95"]
     assert low < WITH_FRICTION.K < high and high - low < 0.1 * WITH_FRICTION.K
     assert "motor does not move as the logged torque predicts" in " ".join(report["meaning"])
+
+
+def test_load_driven_fit_recovers_stiffness_under_load_friction():
+    found = fit_of_side(LoadDrivenModel, model_of(WITH_LOAD_FRICTION), stretches_of(WITH_LOAD_FRICTION))
+    assert found is not None
+    for path, estimate in uncertainty(found).estimates.items():
+        truth = getattr(WITH_LOAD_FRICTION, path)
+        assert abs(estimate.value - truth) < 4.0 * estimate.std, (path, estimate)
+    assert uncertainty(found).estimates["K"].std < 0.01 * WITH_LOAD_FRICTION.K
+
+
+@pytest.mark.parametrize("share", [0.6, 2.0])
+def test_base_fit_fixes_parameters_at_the_load_driven_fit(share):
+    """A load that rubs, or hardly moves at all."""
+    joint = dataclasses.replace(WITH_LOAD_FRICTION, load_friction=share * SMOOTH.rms * SMOOTH.N)
+    found = base_fit(model_of(joint), stretches_of(joint))
+    assert is_held(found)
+    assert float(found.model.get("K")) == pytest.approx(joint.K, rel=0.001)
+    behind = fit_behind_fixed_values(found)
+    assert behind is not None and isinstance(behind.model, LoadDrivenModel)
+
+
+def test_report_states_intervals_from_the_motor_equation():
+    experiment = stretches_of(WITH_LOAD_FRICTION)[0].experiment
+    report = report_dict(fit_only(model_of(WITH_LOAD_FRICTION), {"zero-order": (experiment,)}, hold="zero-order"))
+    assert report["parameters_from"] == "motor equation"
+    low, high = report["before"]["parameters"]["K"]["ci95"]
+    assert low < WITH_LOAD_FRICTION.K < high and high - low < 0.1 * WITH_LOAD_FRICTION.K
+    assert "load does not move as the logged torque predicts" in " ".join(report["meaning"])
