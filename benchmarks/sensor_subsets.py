@@ -36,6 +36,7 @@ class Kind:
         current: whether the motor's current is logged in the place of its torque.
         noisy: noise of the logged torque, as a share of its rms value.
         late: whether the load's encoder is read late by up to a sample interval.
+        load_friction: Coulomb friction of the load at most, as a share of N times the rms torque.
     """
 
     outputs: tuple[str, ...]
@@ -44,11 +45,13 @@ class Kind:
     current: bool = False
     noisy: float = 0.0
     late: bool = False
+    load_friction: float = 0.0
 
     @property
     def missing(self) -> list[str]:
         """Families of the effects that the base model lacks."""
-        return ["motor_friction"] * (self.friction > 0.0) + ["sensor_delay"] * self.late
+        there = {"motor_friction": self.friction, "load_friction": self.load_friction, "sensor_delay": self.late}
+        return [family for family, size in there.items() if size]
 
 
 MOTOR, BOTH, BOTH_SPEEDS = ("motor_angle",), ("motor_angle", "load_angle"), ("motor_velocity", "load_velocity")
@@ -69,12 +72,14 @@ KINDS = {
     "both angles, noisy torque": Kind(BOTH, noisy=0.03),
     "both angles, late encoder": Kind(BOTH, late=True),
     "motor angle, noisy torque": Kind(MOTOR, noisy=0.03),
+    "both angles, friction of the load": Kind(BOTH, load_friction=0.8),
 }
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A drawn joint [SI]; `rest` is the motor's rate over which the sign of its friction turns."""
+    """A drawn joint [SI]; `rest` is the motor's rate over which the sign of its friction turns, and N times the
+    load's."""
 
     N: float
     J_m: float
@@ -85,6 +90,7 @@ class Joint:
     viscous: float
     rest: float
     late: float
+    load_coulomb: float
     step: float
     torque: np.ndarray
 
@@ -96,7 +102,8 @@ class Joint:
             x, v = y[0] / self.N - y[1], y[2] / self.N - y[3]
             tau = self.K * x + self.B_sp * v
             rubbing = self.coulomb * np.tanh(y[2] / self.rest) + self.viscous * y[2]
-            return [y[2], y[3], (T - rubbing - tau / self.N) / self.J_m, tau / self.J_l]
+            held = self.load_coulomb * np.tanh(y[3] * self.N / self.rest)
+            return [y[2], y[3], (T - rubbing - tau / self.N) / self.J_m, (tau - held) / self.J_l]
 
         solver = ode(rates).set_integrator("dop853", rtol=1e-9, atol=1e-12, nsteps=100_000)
         solver.set_initial_value(np.zeros(4), 0.0)
@@ -127,7 +134,9 @@ def drawn(kind: Kind, random: np.random.Generator) -> Joint:
     speed = rms / (J_m + J_l / N**2) / natural
     coulomb, viscous = (kind.friction * rms * random.uniform(0.2, 1.0) for _ in range(2))
     own = N, J_m, J_l, K, 2 * damping * np.sqrt(K * reduced), float(coulomb), float(viscous / speed)
-    return Joint(*own, 2e-3 * speed, kind.late * step * random.uniform(0.1, 1.0), step, torque)
+    late = kind.late * step * random.uniform(0.1, 1.0)
+    held = N * rms * kind.load_friction * random.uniform(0.2, 1.0) if kind.load_friction else 0.0
+    return Joint(*own, 2e-3 * speed, late, float(held), step, torque)
 
 
 def written(folder: Path, kind: Kind, joint: Joint, random: np.random.Generator) -> None:

@@ -102,8 +102,6 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     current, superfluous, without = _without_superfluous(accepted, current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
-    if kept and not dropped:
-        without[kept[-1].winner.name] = kept[-1].before
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise)
@@ -113,19 +111,17 @@ def _without_superfluous(
     names: Sequence[str], current: Trial, base: Trial, study: Study
 ) -> tuple[Trial, list[str], dict[str, Trial]]:
     """The model without superfluous effects, their names, and the model without each of the others. An effect, or a
-    hold, is superfluous if its removal hardly changes the error on selection data.
+    hold, is superfluous if its removal hardly changes the error on selection data. The last one may be as well, where
+    the others were completed beside it.
 
     Args:
-        names: of what was accepted, in that order. The last was accepted beside all others: it is tried only where one
-            of these was dropped.
+        names: of what was accepted, in that order.
         current: the model.
         base: the model without effects.
         study: the data and their segmentation.
     """
     dropped, without = [], {}
-    for i, name in enumerate(names):
-        if i == len(names) - 1 and not dropped:
-            break
+    for name in names if len(names) > 1 else ():
         poorer = refitted_without([name], current, base, study)
         if poorer.held_out.objective - current.held_out.objective < RULES.least_gain:
             dropped.append(name)

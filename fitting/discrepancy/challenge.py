@@ -78,6 +78,9 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         else:
             beside = _learned(standing, study.with_substeps(named.training.substeps))
             if beside is not None:
+                completed = _without_learned(base, named, beside, study)
+                if completed is not None:
+                    return challenge_names(base, completed, study, noise=noise)
                 named, beside = _without_superfluous(base, named, beside, study)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
@@ -131,6 +134,16 @@ def _names(base: Trial, named: Trial) -> set[str]:
     """Names of a model's effects and of another hold."""
     found = {e.name for e in named.model.effects}
     return found | ({"hold"} if named.hold != base.hold else set())
+
+
+def _without_learned(base: Trial, named: Trial, beside: Unknown, study: Study) -> Trial | None:
+    """The named model refitted from its values beside the learned term, where they make this superfluous: its error
+    on selection data is hardly larger. The named fit had then not reached its minimum."""
+    learned = {e.name for e in beside.trial.model.effects} - {e.name for e in named.model.effects}
+    if not named.model.effects or not learned:
+        return None
+    alone = refitted_without(learned, beside.trial, base, study)
+    return alone if alone.held_out.objective - beside.trial.held_out.objective < RULES.least_gain else None
 
 
 def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Study) -> tuple[Trial, Unknown]:

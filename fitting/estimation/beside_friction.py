@@ -2,7 +2,7 @@
 
 The base model can take energy from the motor only through the mesh, so that friction of the motor leads its fit to any
 K. Where both angles were measured, the load's equation of motion determines K (see
-[`fitting.estimation.motor_driven`][]). Here friction is fitted together with the drive. Where it explains most of the
+[`fitting.estimation.one_side`][]). Here friction is fitted together with the drive. Where it explains most of the
 residual, the drive's parameters are fixed at that fit's values.
 """
 

@@ -61,6 +61,14 @@ def test_hold_made_superfluous_by_later_effects_is_dropped(monkeypatch: pytest.M
     monkeypatch.setattr(effect_search, "refitted_without", lambda names, *_: refits[names[0]])
     found, dropped, without = effect_search._without_superfluous(list(refits), current, trial(0.0), cast(Any, None))
     assert dropped == (["linear hold"] if better else [])
-    # The last one is tried again where another was dropped.
     assert found is (reverted if better else current)
-    assert set(without) == ({"motor_friction"} if better else {"linear hold"})
+    assert set(without) == (set(refits) - set(dropped))
+
+
+def test_last_effect_is_dropped_where_the_others_improved_beside_it(monkeypatch: pytest.MonkeyPatch):
+    current, equal, poor = (SimpleNamespace(held_out=SimpleNamespace(objective=o)) for o in (-20.0, -20.0, -10.0))
+    refits = {"load_friction": poor, "cubic_damping": equal}
+    monkeypatch.setattr(effect_search, "refitted_without", lambda names, *_: refits[names[0]])
+    arguments = cast(Any, (list(refits), current, poor, None))
+    found, dropped, _ = effect_search._without_superfluous(*arguments)
+    assert dropped == ["cubic_damping"] and found is equal

@@ -197,3 +197,26 @@ def test_names_without_strength_beside_a_learned_term_are_dropped(
     # The states of dropped effects are removed with them; creep has one.
     assert beside.states.shape == beside.push.shape == (2, 3 if "creep" in left else 2)
     assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)
+
+
+@pytest.mark.parametrize(("objective", "superfluous"), [(-7.0, True), (-6.99, False), (-5.0, False)])
+def test_learned_term_is_dropped_where_named_effects_reach_its_error(
+    base: Trial, objective: float, superfluous: bool, monkeypatch: pytest.MonkeyPatch
+):
+    def with_effects(*effects, objective: float) -> Trial:
+        model = base.model.with_effects(*effects)
+        return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
+
+    named, trial = (
+        with_effects(*e, objective=o) for e, o in (((TorqueBias(),), -5.0), ((TorqueBias(), LEARNED), -7.0))
+    )
+    alone = with_effects(TorqueBias(), objective=objective)
+    asked = []
+    monkeypatch.setattr(module, "refitted_without", lambda names, *_: asked.append(names) or alone)
+    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
+    no_states = np.zeros((2, 2))
+    beside = Unknown(named, trial, (), chosen, np.arange(2), no_states, Conditions(), no_states, 2.0, 0.005)
+    study = Study({}, Setting(Segmentation(32)))
+    assert module._without_learned(base, named, beside, study) is (alone if superfluous else None)
+    assert asked == [{LEARNED.name}]
+    assert module._without_learned(base, replace(named, model=base.model), beside, study) is None
