@@ -143,7 +143,13 @@ def _without_learned(base: Trial, named: Trial, beside: Unknown, study: Study) -
     if not named.model.effects or not learned:
         return None
     alone = refitted_without(learned, beside.trial, base, study)
-    return alone if alone.held_out.objective - beside.trial.held_out.objective < RULES.least_gain else None
+    return alone if _misses_little(alone, beside) else None
+
+
+def _misses_little(trial: Trial, beside: Unknown) -> bool:
+    """Whether the error on selection data is hardly larger than beside the learned term."""
+    missed = trial.held_out.objective - beside.trial.held_out.objective
+    return missed < max(RULES.least_gain, RULES.little * beside.gain)
 
 
 def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Study) -> tuple[Trial, Unknown]:
@@ -154,8 +160,7 @@ def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Stud
     if not fallen:
         return named, beside
     trial = refitted_without(fallen, beside.trial, base, study)
-    missed = trial.held_out.objective - beside.trial.held_out.objective
-    if missed >= max(RULES.least_gain, RULES.little * beside.gain):
+    if not _misses_little(trial, beside):
         return named, beside
     bare = base
     if fallen != names or named.hold != base.hold:

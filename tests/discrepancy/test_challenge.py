@@ -199,7 +199,7 @@ def test_names_without_strength_beside_a_learned_term_are_dropped(
     assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)
 
 
-@pytest.mark.parametrize(("objective", "superfluous"), [(-7.0, True), (-6.99, False), (-5.0, False)])
+@pytest.mark.parametrize(("objective", "superfluous"), [(-7.0, True), (-6.91, True), (-6.8, False), (-5.0, False)])
 def test_learned_term_is_dropped_where_named_effects_reach_its_error(
     base: Trial, objective: float, superfluous: bool, monkeypatch: pytest.MonkeyPatch
 ):
