@@ -9,7 +9,6 @@ from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_he
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
-from fitting.estimation.one_side import SIDES
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import FitOnly
@@ -22,7 +21,7 @@ from fitting.validation.frequency_response import frequency_response
 from fitting.validation.goodness_of_fit import goodness
 from fitting.validation.residual_diagnostics import diagnose
 from fitting.validation.residual_tests import residual_tests
-from hdjax import Hold, Model, TwoInertiaModel
+from hdjax import Hold, Model, OneSideModel, TwoInertiaModel
 
 
 def fit_only(
@@ -58,7 +57,7 @@ def fit_only(
     progress("final fit over long horizons")
     fixed_by = fit_behind_fixed_values(base)
     source, assumed = "torque", {}
-    if fixed_by is not None and isinstance(fixed_by.model, SIDES):
+    if fixed_by is not None and isinstance(fixed_by.model, OneSideModel):
         source = f"{fixed_by.model.equation} equation"
         base, assumed = _without_priors(base, fixed_by.model.scaled_by)
     elif fixed_by is not None:

@@ -287,6 +287,18 @@ class TwistModel(Model):
     def outputs(self, state: State) -> Float[Array, "1"]:
         return state[:1]
 
+    @abc.abstractmethod
+    def twist_acceleration(self, torque: Array, tau: Array, load_torque: Array) -> Array:
+        """x'' [rad/s^2] under the torque, the mesh torque tau, and the load torque."""
+
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
+        motion = self.motion(state, conditions)
+        own = self._own_states(state)
+        acceleration = self.twist_acceleration(torque, self._mesh_torque(motion, own), load_torque)
+        return self._with_own_rates(motion, [state[1], acceleration], own)
+
 
 class ReducedModel(TwistModel):
     """The dynamic error alone, `x'' = gain u - torque(x, v, ...)`. States: x, v."""
@@ -299,70 +311,59 @@ class ReducedModel(TwistModel):
             if effect.needs_motor:
                 raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
 
-    def component_rates(
-        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
-    ) -> list[Array]:
-        motion = self.motion(state, conditions)
-        own = self._own_states(state)
-        rates = [state[1], self.drive.gain * torque - self._mesh_torque(motion, own)]
-        return self._with_own_rates(motion, rates, own)
+    def twist_acceleration(self, torque: Array, tau: Array, load_torque: Array) -> Array:
+        return self.drive.gain * torque - tau
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0
 
 
-class MotorDrivenModel(TwistModel):
-    """The load behind the mesh for a given motion of the motor.
-
-        x'' = theta_m''/N - (tau + T_l)/J_l
-
-    The motor's acceleration over N [rad/s^2] takes the place of the torque. States: x, v.
+class OneSideModel(TwistModel):
+    """One side behind the mesh for a given motion of the other. States: x, v.
 
     Attributes:
         equation: the side whose equation of motion it is.
         scaled_by: parameters of the drive that K and B_sp are in proportion to.
     """
 
-    equation: ClassVar[str] = "load"
-    scaled_by: ClassVar[tuple[str, ...]] = ("J_l",)
+    equation: ClassVar[str]
+    scaled_by: ClassVar[tuple[str, ...]]
 
     drive: Drive
     effects: tuple[Effect, ...] = ()
 
-    def component_rates(
-        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
-    ) -> list[Array]:
-        motion = self.motion(state, conditions)
-        own = self._own_states(state)
-        rates = [state[1], torque - (self._mesh_torque(motion, own) + load_torque) / self.drive.J_l]
-        return self._with_own_rates(motion, rates, own)
+
+class MotorDrivenModel(OneSideModel):
+    """The load behind the mesh for a given motion of the motor.
+
+        x'' = theta_m''/N - (tau + T_l)/J_l
+
+    The motor's acceleration over N [rad/s^2] takes the place of the torque.
+    """
+
+    equation: ClassVar[str] = "load"
+    scaled_by: ClassVar[tuple[str, ...]] = ("J_l",)
+
+    def twist_acceleration(self, torque: Array, tau: Array, load_torque: Array) -> Array:
+        return torque - (tau + load_torque) / self.drive.J_l
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0 / self.drive.J_l
 
 
-class LoadDrivenModel(TwistModel):
+class LoadDrivenModel(OneSideModel):
     """The motor behind the mesh for a given motion of the load.
 
         x'' = (k_T T_m - tau/N)/(N J_m) - theta_l''
 
-    The load's acceleration [rad/s^2] takes the place of the load torque. States: x, v. Attributes as in
-    [`MotorDrivenModel`][].
+    The load's acceleration [rad/s^2] takes the place of the load torque.
     """
 
     equation: ClassVar[str] = "motor"
     scaled_by: ClassVar[tuple[str, ...]] = ("J_m", "k_T")
 
-    drive: Drive
-    effects: tuple[Effect, ...] = ()
-
-    def component_rates(
-        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
-    ) -> list[Array]:
-        motion = self.motion(state, conditions)
-        own = self._own_states(state)
-        turning = (self.drive.k_T * torque - self._mesh_torque(motion, own) / self.drive.N) / self.drive.J_m
-        return self._with_own_rates(motion, [state[1], turning / self.drive.N - load_torque], own)
+    def twist_acceleration(self, torque: Array, tau: Array, load_torque: Array) -> Array:
+        return (self.drive.k_T * torque - tau / self.drive.N) / self.drive.J_m / self.drive.N - load_torque
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0 / (self.drive.J_m * self.drive.N**2)

@@ -244,14 +244,14 @@ def fit_behind_fixed_values(found: Fit) -> Fit | None:
         return None
     if not sees_twist(found.stretches):
         return refitted_beside(found)
-    driven = one_side_fit(with_priors(found.model, ()), found.stretches)
-    if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
-        return None
-    # The fit determines the stiffness only in proportion to that side's inertia.
-    side = type(driven.model)
-    assert issubclass(side, SIDES)
-    known = tuple(p for p in found.model.drive.priors if p.path in side.scaled_by and np.isfinite(p.tolerance))
-    return fit_of_side(side, with_priors(found.model, known), found.stretches) if known else driven
+    for side in SIDES:
+        driven = fit_of_side(side, with_priors(found.model, ()), found.stretches)
+        if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
+            continue
+        # The fit determines the stiffness only in proportion to that side's inertia.
+        known = tuple(p for p in found.model.drive.priors if p.path in side.scaled_by and np.isfinite(p.tolerance))
+        return fit_of_side(side, with_priors(found.model, known), found.stretches) if known else driven
+    return None
 
 
 def need_double_precision() -> None:

@@ -20,9 +20,9 @@ from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.starting_values import starts_of_equation
-from hdjax import LoadDrivenModel, Model, MotorDrivenModel, PiecewisePolynomial, TwoInertiaModel
+from hdjax import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, PiecewisePolynomial, TwoInertiaModel
 
-SIDES: tuple[type[MotorDrivenModel | LoadDrivenModel], ...] = (MotorDrivenModel, LoadDrivenModel)
+SIDES: tuple[type[OneSideModel], ...] = (MotorDrivenModel, LoadDrivenModel)
 
 
 def one_side_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
@@ -36,9 +36,7 @@ def one_side_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | 
     return min(fits, key=lambda found: found.objective, default=None)
 
 
-def fit_of_side(
-    side: type[MotorDrivenModel | LoadDrivenModel], model: TwoInertiaModel, stretches: Sequence[Stretch]
-) -> Fit | None:
+def fit_of_side(side: type[OneSideModel], model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
     """Fit K, alpha and B_sp to one side's motion for the measured motion of the other.
 
     Args:
@@ -85,7 +83,7 @@ def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
     return fit(model, driven, base_paths(model), segmentation)
 
 
-def _driven(side: type[MotorDrivenModel | LoadDrivenModel], stretch: Stretch) -> Stretch:
+def _driven(side: type[OneSideModel], stretch: Stretch) -> Stretch:
     """A stretch with the acceleration of the motor over N in place of the motor torque, or with that of the load in
     place of the load torque."""
     # Imported here: most logs do not need it.

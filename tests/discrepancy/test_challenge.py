@@ -1,5 +1,6 @@
 """When named effects stand against a learned term, and when they are withdrawn."""
 
+import functools
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -159,6 +160,11 @@ def base() -> Trial:
     return base_trial(rig.reduced_model(), data, "zero-order")[0]
 
 
+def _with_effects(base: Trial, *effects, objective: float) -> Trial:
+    model = base.model.with_effects(*effects)
+    return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
+
+
 @pytest.mark.parametrize(
     ("told", "missed_by", "left"),
     [
@@ -173,9 +179,7 @@ def base() -> Trial:
 def test_names_without_strength_beside_a_learned_term_are_dropped(
     base: Trial, told: set[str], missed_by: float, left: set[str], monkeypatch: pytest.MonkeyPatch
 ):
-    def with_effects(*effects, objective: float) -> Trial:
-        model = base.model.with_effects(*effects)
-        return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
+    with_effects = functools.partial(_with_effects, base)
 
     def refitted_without(fallen, trial, base, study):
         kept = [e for e in trial.model.effects if e.name not in fallen]
@@ -203,9 +207,7 @@ def test_names_without_strength_beside_a_learned_term_are_dropped(
 def test_learned_term_is_dropped_where_named_effects_reach_its_error(
     base: Trial, objective: float, superfluous: bool, monkeypatch: pytest.MonkeyPatch
 ):
-    def with_effects(*effects, objective: float) -> Trial:
-        model = base.model.with_effects(*effects)
-        return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
+    with_effects = functools.partial(_with_effects, base)
 
     named, trial = (
         with_effects(*e, objective=o) for e, o in (((TorqueBias(),), -5.0), ((TorqueBias(), LEARNED), -7.0))
