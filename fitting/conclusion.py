@@ -17,6 +17,7 @@ from fitting.discrepancy.learn import Unknown, learn_supported
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.estimation.whole_log_fit import long_fit
+from fitting.one_side_check import better_side, with_values_of
 from fitting.uncertainty.measurement_noise import MeasurementNoise
 from fitting.uncertainty.noise_model import NoiseModel
 from fitting.validation.account import excess, free_runs
@@ -37,6 +38,7 @@ class Conclusion(eqx.Module):
         runs_at_first: free runs of the base model.
         noise: covariance of the measurement noise of the outputs.
         left: noise of sensors and torque, where that explains the residual.
+        side: the fit of one side's equation at which the final model's K, alpha and B_sp are fixed, if any.
     """
 
     outcome: Outcome = eqx.field(static=True)
@@ -48,6 +50,7 @@ class Conclusion(eqx.Module):
     runs_at_first: tuple[FreeRun, ...]
     noise: Float[Array, "outputs outputs"]
     left: NoiseModel | None
+    side: Fit | None
 
     @property
     def final(self) -> Trial:
@@ -80,7 +83,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
 
     study.progress("final fit over long horizons")
     current = trusted if unknown is None else unknown.trial
-    fitted = long_fit(current.training)
+    fitted, side = _fitted_to_the_end(current.training, seen)
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
@@ -92,13 +95,21 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
         if outcome == "unexplained":
             # A learned term that follows long stretches may replace names that do not.
             instead = learn_supported(base, study)
-            other = None if instead is None else long_fit(instead.trial.training)
-            if instead is not None and other is not None:
+            if instead is not None:
+                seen_instead = replace(_final_evidence(base, base, instead, covariance), surprise=None)
+                other, side_instead = _fitted_to_the_end(instead.trial.training, seen_instead)
                 instead_runs = along_selection(other, instead.trial.hold)
                 if rms_error(instead_runs) < rms_error(runs):
                     trusted, unknown, fitted, runs = base, instead, other, instead_runs
-                    seen = replace(_final_evidence(base, base, instead, covariance), surprise=None)
-    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left)
+                    seen, side = seen_instead, side_instead
+    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left, side)
+
+
+def _fitted_to_the_end(found: Fit, seen: FinalEvidence) -> tuple[Fit, Fit | None]:
+    """The final fit over long horizons; where the model leaves more than noise, with K, alpha and B_sp of the side
+    whose own equation leaves none, and that side's fit."""
+    side = better_side(found) if max(seen.excess) >= RULES.excess else None
+    return long_fit(found if side is None else with_values_of(side, found)), side
 
 
 def _final_evidence(

@@ -21,6 +21,7 @@ from fitting.estimation.experiment import Experiment, Stretch, split, whole
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from fitting.estimation.whole_log_fit import refitted_on_all
+from fitting.one_side_check import source_of
 from fitting.outcome import Finding, Loop
 from fitting.progress import Progress, silent
 from fitting.search_options import SearchOptions
@@ -127,6 +128,7 @@ class _Closed:
             after_substeps=end.fitted.substeps,
             stretches=self.study.data[final.hold],
             surprise=end.seen.surprise,
+            parameters_from=source_of(end.side),
             put_back=late,
             seconds=clock.laps,
         )
@@ -136,12 +138,12 @@ class _Closed:
         nothing was found."""
         end = self.end
 
-        def accounted(trial: Trial, fitted: Fit, runs: tuple[FreeRun, ...]) -> Account:
+        def accounted(trial: Trial, fitted: Fit, runs: tuple[FreeRun, ...], side: Fit | None = None) -> Account:
             both, test = refitted_on_all(fitted, trial.held_out), tests.get(trial.hold, ())
             known = {"noise": end.noise, "halo": self.study.setting.halo}
-            return account(both, self.study.data[trial.hold][0], test, selection=runs, **known)
+            return account(both, self.study.data[trial.hold][0], test, selection=runs, drive_from=side, **known)
 
-        after = accounted(end.final, end.fitted, end.runs)
+        after = accounted(end.final, end.fitted, end.runs, end.side)
         if end.final is self.base:
             return after, after
         return accounted(self.base, self.base.training, end.runs_at_first), after

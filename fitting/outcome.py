@@ -128,6 +128,8 @@ class Loop(eqx.Module):
         stretches: training and selection stretches.
         surprise: error of free runs along selection stretches over their bands, where accepted effects do not explain
             it and no learned term is better; None otherwise.
+        parameters_from: "torque"; or the "load equation" or "motor equation" for K, alpha and B_sp of the final model,
+            see [`fitting.one_side_check`][].
         put_back: time offset subtracted from each log's clock [s], so that a line is in phase.
         seconds: time by stage.
     """
@@ -154,6 +156,7 @@ class Loop(eqx.Module):
     after_substeps: int = eqx.field(static=True)
     stretches: tuple[tuple[Stretch, ...], tuple[Stretch, ...]]
     surprise: float | None
+    parameters_from: str = eqx.field(static=True)
     put_back: tuple[float, ...] = eqx.field(static=True)
     seconds: dict[str, float]
 

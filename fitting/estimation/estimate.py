@@ -55,7 +55,8 @@ class Strategy:
         least_progress: least relative decrease of the sum of squares over a few steps, see
             [`fitting.estimation.solve.solve`][].
         reweigh: whether to reweigh by the residual's covariance; with False the initial covariance is kept.
-        hold_parameters: fit the initial states only, by the same program that fits the parameters.
+        hold_parameters: whether only the initial states are fitted, by the same program that fits the parameters; or
+            the dotted paths of the parameters that are fixed.
         begin_anew_above: an objective above which a first pass that does not converge is repeated from the first
             samples of each segment.
         retry_states: whether segments with a large error after the first pass are repeated likewise: they may have
@@ -66,7 +67,7 @@ class Strategy:
     max_steps: int = 60
     least_progress: float = 0.0
     reweigh: bool = True
-    hold_parameters: bool = False
+    hold_parameters: bool | tuple[str, ...] = False
     begin_anew_above: float = -np.inf
     retry_states: bool = True
     give_up_above: float = np.inf
@@ -138,6 +139,12 @@ class Fit(eqx.Module):
         """Values per sample of the segments, rearranged by stretch, without padding."""
         parts = np.split(values, np.cumsum(self.pieces))
         return [a.reshape(-1, *a.shape[2:])[: len(s)] for s, a in zip(self.stretches, parts, strict=False)]
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Dotted paths of the parameters that were fixed."""
+        active = np.asarray(self.problem.active)
+        return tuple(path for path, free in zip(self.free.paths, active, strict=True) if not free)
 
     def with_all_free(self) -> "Fit":
         """The same with fixed parameters counted as free, to compute what the data say about them."""

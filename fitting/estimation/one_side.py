@@ -17,7 +17,7 @@ import numpy as np
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import MESH, base_paths
+from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.starting_values import starts_of_equation
 from hdjax import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, PiecewisePolynomial, TwoInertiaModel
@@ -59,6 +59,19 @@ def fit_of_side(side: type[OneSideModel], model: TwoInertiaModel, stretches: Seq
     coarse = [_fitted(start, driven, horizon) for start in starts]
     best = min(coarse, key=lambda found: found.objective)
     return _fitted(best.model, driven, short_horizon(best.model, driven))
+
+
+def known_to(side: type[OneSideModel], model: TwoInertiaModel) -> TwoInertiaModel | None:
+    """The base model with priors for one side's equation; None where a value that scales its K is unknown.
+
+    Args:
+        side: the equation.
+        model: of the drive, with its priors.
+    """
+    priors = tuple(p for p in model.drive.priors if p.path in side.scaled_by)
+    if any(np.isinf(p.tolerance) for p in priors):
+        return None
+    return with_priors(TwoInertiaModel(model.drive), priors)
 
 
 def held_at(model: Model, found: Fit) -> Fit:

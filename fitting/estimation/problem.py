@@ -57,7 +57,7 @@ def pose(
     paths: Sequence[str],
     segmentation: Segmentation,
     *,
-    hold_parameters: bool = False,
+    hold_parameters: bool | tuple[str, ...] = False,
     states: Float[Array | np.ndarray, "segments states"] | None = None,
     engine: Engine | None = None,
 ) -> tuple[Problem, Unknowns]:
@@ -68,7 +68,7 @@ def pose(
         stretches: the data.
         paths: dotted paths of the free parameters.
         segmentation: how the data are cut into segments.
-        hold_parameters: whether only the initial states are free.
+        hold_parameters: whether only the initial states are free; or the dotted paths of the fixed parameters.
         states: initial states of the segments; from their first samples where not given.
         engine: that evaluates the residual, see [`fitting.estimation.estimate.fit`][].
     """
@@ -80,7 +80,9 @@ def pose(
     if states is None:
         states = initial_states(model, segments)
     unknowns = Unknowns(free.pack(model), states)
-    active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
+    if isinstance(hold_parameters, bool):
+        hold_parameters = tuple(paths) if hold_parameters else ()
+    active = jnp.asarray(np.array([0.0 if path in hold_parameters else 1.0 for path in paths]))
     outputs = segments.measured.shape[-1]
     unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
     problem = Problem(model, free, segments, *unweighed, substeps=substeps, engine=engine)

@@ -90,7 +90,7 @@ def _on_both(found: Fit, selection: Fit, horizon: int, substeps: int) -> Fit:
         found.free.paths,
         replace(found.segmentation, horizon=horizon, substeps=substeps, count=len(states)),
         start=Start(found.covariance, jnp.asarray(states)),
-        strategy=replace(_CONTINUED, hold_parameters=held),
+        strategy=replace(_CONTINUED, hold_parameters=held or found.held),
     )
     return both.with_all_free()
 
@@ -178,6 +178,8 @@ def _fine_enough(found: Fit) -> int:
 
 def _again(found: Fit, segmentation: Segmentation, strategy: Strategy = _CONTINUED) -> Fit:
     """A fit of the same data on segments of the same length, with the same compiled program, started from its
-    states."""
+    states; what was fixed stays fixed."""
     start = Start(found.covariance, found.unknowns.states)
+    if not strategy.hold_parameters:
+        strategy = replace(strategy, hold_parameters=found.held)
     return fit(found.model, found.stretches, found.free.paths, segmentation, start=start, strategy=strategy)

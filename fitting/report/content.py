@@ -77,6 +77,7 @@ def report_dict(
             "memory": outcome.noise_memory if is_loop else None,
             "torque": outcome.torque_noise if is_loop else None,
         },
+        "parameters_from": outcome.parameters_from,
         "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
         "extrapolation": _extrapolation(outcome, units),

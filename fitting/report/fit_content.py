@@ -34,7 +34,6 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     """
     g, account = fitted.goodness, fitted.account
     return {
-        "parameters_from": fitted.parameters_from,
         "assumed": dict(fitted.assumed),
         "goodness": {
             "fit_percent": dict(g.fit_percent),

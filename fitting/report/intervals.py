@@ -77,7 +77,7 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
     much = times_noise >= RULES.excess
     learned = report.get("unknown") or {}
     names = formatting.words(list(report["before"]["parameters"]))
-    if (learned.get("place"), learned.get("quantity")) == ("mesh", "torque"):
+    if (learned.get("place"), learned.get("quantity"), report["parameters_from"]) == ("mesh", "torque", "torque"):
         note = f"A learned torque acts beside {names} in the mesh: they are not unique, their intervals withheld."
         _mark(report["after"], note, withheld=True)
     if not (unexplained or much):
@@ -89,7 +89,9 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
     )
     end = "their intervals are withheld" if unexplained and much else "their intervals do not include that"
     note = f"{left}: {names} may be off by more than their standard errors, and {end}."
-    for account in (report["before"], report["after"]):
+    # One side's own equation leaves no more than noise.
+    ends = ("before", "after") if report["parameters_from"] == "torque" else ("before",)
+    for account in (report[end] for end in ends):
         _mark(account, note, withheld=unexplained and much)
 
 

@@ -80,6 +80,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     notes = list(dict.fromkeys(n for n in told if n)) + _unseen(report)
     notes += [h["sentence"] for h in found["held"]]
     notes += [_of_prior(path, e) for path, e in final["parameters"].items() if (e.get("prior") or {}).get("tolerance")]
+    notes += _of_one_side(report)
     for other in report["alternatives"]:
         if not other["separable"]:
             notes.append(
@@ -119,6 +120,17 @@ def _unseen(report: Mapping[str, Any]) -> list[str]:
             "Angles were integrated from velocities, so that effects that depend on an angle are poorly determined."
         )
     return notes
+
+
+def _of_one_side(report: Mapping[str, Any]) -> list[str]:
+    """Source of the drive's parameters in a final model that leaves more than noise."""
+    if report["decision"] == "fit_only" or report["parameters_from"] == "torque":
+        return []
+    side, other = ("load", "motor") if report["parameters_from"] == "load equation" else ("motor", "load")
+    return [
+        f"The final model does not explain all that acts on the {other}. K, alpha and B_sp are therefore those of the "
+        f"{side}'s own equation, driven by the {other}'s motion as measured: it leaves no more than noise."
+    ]
 
 
 def _of_prior(path: str, estimate: Mapping[str, Any]) -> str:

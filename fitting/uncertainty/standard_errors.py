@@ -61,20 +61,39 @@ class Uncertainty(eqx.Module):
     unit_covariance: Float[np.ndarray, "parameters parameters"]
 
     def in_units_of(self, fit: Fit, source: Fit) -> "Uncertainty":
-        """The same for the parameters and the free vector of another fit.
+        """The same for the parameters that another fit shares, in units of its free vector.
 
         Args:
-            fit: the other fit; its parameters are a subset of these.
+            fit: the other fit.
             source: the fit whose uncertainty this is.
         """
-        own = [source.free.paths.index(path) for path in fit.free.paths]
-        ratio = np.asarray(source.free.slopes(source.model))[own] / np.asarray(fit.free.slopes(fit.model))
+        shared = [path for path in fit.free.paths if path in source.free.paths]
+        own, theirs = ([f.free.paths.index(path) for path in shared] for f in (source, fit))
+        ratio = np.asarray(source.free.slopes(source.model))[own] / np.asarray(fit.free.slopes(fit.model))[theirs]
         kept, both = np.ix_(own, own), np.outer(ratio, ratio)
         return Uncertainty(
-            {path: self.estimates[path] for path in fit.free.paths},
+            {path: self.estimates[path] for path in shared},
             self.correlation[kept],
             both * self.covariance[kept],
             both * self.unit_covariance[kept],
+        )
+
+    def with_parameters_of(self, other: "Uncertainty") -> "Uncertainty":
+        """The same with some parameters from another source, whose errors are uncorrelated with those of the rest."""
+        known = list(self.estimates)
+        own = [known.index(path) for path in other.estimates]
+
+        def both(mine: np.ndarray, given: np.ndarray) -> np.ndarray:
+            found = mine.copy()
+            found[own], found[:, own] = 0.0, 0.0
+            found[np.ix_(own, own)] = given
+            return found
+
+        return Uncertainty(
+            self.estimates | other.estimates,
+            both(self.correlation, other.correlation),
+            both(self.covariance, other.covariance),
+            both(self.unit_covariance, other.unit_covariance),
         )
 
     def of_effect(self, name: str) -> tuple[list[str], Float[np.ndarray, "own own"]]:

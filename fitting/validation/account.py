@@ -71,6 +71,7 @@ def account(
     selection: tuple[FreeRun, ...] = (),
     profiles: bool = False,
     std_from: Fit | None = None,
+    drive_from: Fit | None = None,
 ) -> Account:
     """Free runs, standard errors and identifiability of a fit.
 
@@ -83,6 +84,8 @@ def account(
         selection: free runs along the selection stretches.
         profiles: whether profile likelihood replaces inaccurate intervals, which compiles a further program.
         std_from: another fit of the same parameters that supplies their standard errors.
+        drive_from: the fit of one side's equation at which the drive's parameters are fixed, and which supplies their
+            standard errors.
     """
     # Separate runs, so that test data do not share the scale of a window.
     seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
@@ -90,6 +93,8 @@ def account(
     found = uncertainty(judged)
     if profiles:
         found = with_profiles(judged, found)
+    if drive_from is not None:
+        found = found.with_parameters_of(uncertainty(drive_from).in_units_of(fit, drive_from))
     told = identifiability(judged, found)
     if std_from is not None:
         found = found.in_units_of(fit, std_from)

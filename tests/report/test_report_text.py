@@ -139,7 +139,7 @@ def _report_with_errors(
 def test_intervals_are_withheld_or_flagged_where_the_residual_is_large(
     decision: str, times_noise: float, withheld: bool, flagged: bool
 ):
-    report = {"decision": decision, "before": _account(), "after": _account(), "unknown": None}
+    report = _uncertain_report(decision, None)
     say_what_intervals_hold(report, times_noise)
     K = report["after"]["parameters"]["K"]
     assert (K["ci95"] == [None, None]) == withheld == is_withheld(report["after"]["derived"]["omega_0"])
@@ -147,12 +147,25 @@ def test_intervals_are_withheld_or_flagged_where_the_residual_is_large(
     assert not flagged or "K may be off" in K["note"]
 
 
+def _uncertain_report(decision: str, unknown: dict[str, str] | None) -> dict[str, Any]:
+    accounts = {"before": _account(), "after": _account()}
+    return {"decision": decision, "unknown": unknown, "parameters_from": "torque"} | accounts
+
+
+@pytest.mark.parametrize("learned", [None, {"place": "mesh", "quantity": "torque"}])
+def test_intervals_of_one_side_are_stated_where_the_residual_is_large(learned: dict[str, str] | None):
+    report = _uncertain_report("unexplained", learned) | {"parameters_from": "load equation"}
+    say_what_intervals_hold(report, 44.0)
+    assert report["after"]["parameters"]["K"] == _account()["parameters"]["K"]
+    assert is_withheld(report["before"]["parameters"]["K"])
+
+
 @pytest.mark.parametrize(
     ("place", "quantity", "withheld"), [("mesh", "torque", True), ("mesh", "error", False), ("load", "torque", False)]
 )
 def test_intervals_beside_a_learned_torque_in_the_mesh_are_withheld(place: str, quantity: str, withheld: bool):
     learned = {"place": place, "quantity": quantity}
-    report = {"decision": "unexplained", "before": _account(), "after": _account(), "unknown": learned}
+    report = _uncertain_report("unexplained", learned)
     say_what_intervals_hold(report, 1.0)
     assert is_withheld(report["after"]["parameters"]["K"]) == withheld
     assert not is_withheld(report["before"]["parameters"]["K"])

@@ -1,0 +1,72 @@
+"""Where one side's own equation leaves only noise, it supplies K, alpha and B_sp of a final model that leaves more."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import joints
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch, experiment_from_log, whole
+from fitting.estimation.free_parameters import MESH, base_paths
+from fitting.estimation.problem import Segmentation, segment_length, short_horizon
+from fitting.estimation.whole_log_fit import long_fit, refitted_on_all
+from fitting.one_side_check import better_side, source_of, with_values_of
+from fitting.uncertainty.standard_errors import uncertainty
+from fitting.validation.account import account
+from hdjax import Drive, TwoInertiaModel
+from hdjax.drive import Prior
+from hdjax.effects import ViscousMotorFriction
+
+SMOOTH = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
+RUBBING = {
+    "load equation": joints.with_friction(SMOOTH, 0.3, 0.2),
+    "motor equation": dataclasses.replace(SMOOTH, load_friction=0.4 * SMOOTH.rms * SMOOTH.N, bend=3e-3),
+}
+
+
+def stretches_of(joint: joints.Joint) -> tuple[Stretch, ...]:
+    return whole([experiment_from_log(joints.log_of(joint), hold="zero-order", N=joint.N)])
+
+
+def wrong_law(joint: joints.Joint, *priors: Prior) -> Fit:
+    """A fit with another friction than the joint has, from the true parameters."""
+    drive = Drive(**{p: getattr(joint, p) for p in ("N", "J_m", "J_l", *MESH)}, priors=priors)
+    model = TwoInertiaModel(drive).with_effects(ViscousMotorFriction())
+    stretches = stretches_of(joint)
+    horizon = short_horizon(model, stretches)
+    paths = (*base_paths(model), "viscous_motor_friction.b")
+    return fit(model, stretches, paths, Segmentation(horizon, segment_length(horizon)))
+
+
+@pytest.mark.parametrize("source", RUBBING)
+def test_side_that_does_not_rub_supplies_the_parameters(source: str):
+    joint = RUBBING[source]
+    found = wrong_law(joint)
+    side = better_side(found)
+    assert side is not None and source_of(side) == source
+    for path, estimate in uncertainty(side).estimates.items():
+        assert abs(estimate.value - getattr(joint, path)) < 4.0 * estimate.std, (path, estimate)
+    assert abs(float(found.model.get("K")) - joint.K) > 4.0 * uncertainty(side).estimates["K"].std
+
+    fixed = with_values_of(side, found)
+    long = long_fit(fixed)
+    both = refitted_on_all(long, fixed)
+    for each in (fixed, long, both):
+        assert [float(each.model.get(p)) for p in MESH] == [float(side.model.get(p)) for p in MESH]
+    assert fixed.held == long.held == MESH
+    assert float(both.model.get("viscous_motor_friction.b")) != float(found.model.get("viscous_motor_friction.b"))
+
+    known = account(both, both.stretches, (), noise=both.covariance, halo=0, drive_from=side).uncertainty
+    own = uncertainty(both).estimates["viscous_motor_friction.b"]
+    assert known.estimates == uncertainty(side).estimates | {"viscous_motor_friction.b": own}
+    assert np.all(np.linalg.eigvalsh(known.correlation) > 0.0)
+    assert np.all(known.correlation[:3, 3] == 0.0)
+
+
+def test_drive_without_friction_has_two_sides_of_noise():
+    assert better_side(wrong_law(SMOOTH)) is None
+
+
+def test_side_whose_inertia_is_unknown_supplies_nothing():
+    assert better_side(wrong_law(RUBBING["load equation"], Prior("J_l", SMOOTH.J_l, np.inf))) is None
