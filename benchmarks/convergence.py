@@ -281,7 +281,7 @@ def judge(drawn: Draw, seed: int, *, short: bool) -> dict:
     placeholder, truth, stretches = log_of(drawn, seed)
     begin = time.perf_counter()
     try:
-        found = base_fit(placeholder, stretches)
+        found = base_fit(placeholder, stretches).fit
     except DataError as error:
         return {"draw": asdict(drawn), "verdict": "refused", "error": str(error)}
     spent = time.perf_counter() - begin

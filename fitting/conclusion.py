@@ -18,9 +18,10 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.one_side_check import better_side, with_values_of
-from fitting.uncertainty.measurement_noise import MeasurementNoise
+from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
-from fitting.validation.account import excess, free_runs
+from fitting.uncertainty.one_side import without_mesh_priors
+from fitting.validation.account import free_runs
 from fitting.validation.free_run_check import share_explained, surprise
 from hdjax import Hold
 
@@ -83,7 +84,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
 
     study.progress("final fit over long horizons")
     current = trusted if unknown is None else unknown.trial
-    fitted, side = _fitted_to_the_end(current.training, seen)
+    fitted, side = _fitted_to_the_end(current.training, seen, study)
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
@@ -97,7 +98,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
             instead = learn_supported(base, study)
             if instead is not None:
                 seen_instead = replace(_final_evidence(base, base, instead, covariance), surprise=None)
-                other, side_instead = _fitted_to_the_end(instead.trial.training, seen_instead)
+                other, side_instead = _fitted_to_the_end(instead.trial.training, seen_instead, study)
                 instead_runs = along_selection(other, instead.trial.hold)
                 if rms_error(instead_runs) < rms_error(runs):
                     trusted, unknown, fitted, runs = base, instead, other, instead_runs
@@ -105,10 +106,13 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left, side)
 
 
-def _fitted_to_the_end(found: Fit, seen: FinalEvidence) -> tuple[Fit, Fit | None]:
+def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[Fit, Fit | None]:
     """The final fit over long horizons; where the model leaves more than noise, with K, alpha and B_sp of the side
     whose own equation leaves none, and that side's fit."""
-    side = better_side(found) if max(seen.excess) >= RULES.excess else None
+    found = eqx.tree_at(lambda f: f.model, found, without_mesh_priors(found.model))
+    if max(seen.excess) < RULES.excess:
+        return long_fit(found), None
+    side = study.side or better_side(found)
     return long_fit(found if side is None else with_values_of(side, found)), side
 
 

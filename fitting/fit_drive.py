@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from fitting.clock import Clock
-from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
+from fitting.estimation.base_fit import BaseFit, base_fit, is_held
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
@@ -49,13 +49,12 @@ def fit_only(
     """
     clock = Clock()
     progress("fitting the base model")
-    hold, base, experiments, test = _base(model, experiments, test or {}, hold)
+    hold, (base, fixed_by), experiments, test = _base(model, experiments, test or {}, hold)
     tests = whole(test.get(hold, ()))
     clock.lap("base fit")
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    fixed_by = fit_behind_fixed_values(base)
     source, assumed = "torque", {}
     if fixed_by is not None and isinstance(fixed_by.model, OneSideModel):
         source = f"{fixed_by.model.equation} equation"
@@ -102,13 +101,13 @@ def _base(
     experiments: Mapping[Hold, tuple[Experiment, ...]],
     test: Mapping[Hold, tuple[Experiment, ...]],
     hold: Hold | None,
-) -> tuple[Hold, Fit, Mapping[Hold, tuple[Experiment, ...]], Mapping[Hold, tuple[Experiment, ...]]]:
+) -> tuple[Hold, BaseFit, Mapping[Hold, tuple[Experiment, ...]], Mapping[Hold, tuple[Experiment, ...]]]:
     """The base fit under the stated or the best hold; and the data with refined values of uncertain sample
     intervals."""
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
-    hold = min(holds, key=lambda h: fits[h].objective)
-    factors = refined_intervals(fits[hold])
+    hold = min(holds, key=lambda h: fits[h].fit.objective)
+    factors = refined_intervals(fits[hold].fit)
     if not factors:
         return hold, fits[hold], experiments, test
     experiments, test = with_intervals(experiments, factors), with_intervals(test, factors)
@@ -122,4 +121,4 @@ def _without_priors(base: Fit, scaled_by: Collection[str]) -> tuple[Fit, dict[st
         return base, {}
     unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path in scaled_by]
     assumed = {path: float(base.model.get(path)) for path in unknown}
-    return base_fit(with_priors(base.model, ()), base.stretches), assumed
+    return base_fit(with_priors(base.model, ()), base.stretches).fit, assumed

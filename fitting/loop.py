@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import equinox as eqx
+
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import CaseEvidence
 from fitting.attribution.decisions import decide
@@ -25,7 +27,9 @@ from fitting.one_side_check import source_of
 from fitting.outcome import Finding, Loop
 from fitting.progress import Progress, silent
 from fitting.search_options import SearchOptions
-from fitting.validation.account import Account, account, excess, free_runs
+from fitting.uncertainty.measurement_noise import excess
+from fitting.uncertainty.one_side import without_mesh_priors
+from fitting.validation.account import Account, account, free_runs
 from fitting.validation.residual_diagnostics import diagnose
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
@@ -139,6 +143,7 @@ class _Closed:
         end = self.end
 
         def accounted(trial: Trial, fitted: Fit, runs: tuple[FreeRun, ...], side: Fit | None = None) -> Account:
+            fitted = eqx.tree_at(lambda f: f.model, fitted, without_mesh_priors(fitted.model))
             both, test = refitted_on_all(fitted, trial.held_out), tests.get(trial.hold, ())
             known = {"noise": end.noise, "halo": self.study.setting.halo}
             return account(both, self.study.data[trial.hold][0], test, selection=runs, drive_from=side, **known)
@@ -146,7 +151,7 @@ class _Closed:
         after = accounted(end.final, end.fitted, end.runs, end.side)
         if end.final is self.base:
             return after, after
-        return accounted(self.base, self.base.training, end.runs_at_first), after
+        return accounted(self.base, self.base.training, end.runs_at_first, self.study.side), after
 
     def _findings(self, after: Account) -> tuple[Finding, ...]:
         """The accepted effects with their final values, largest gain first; a learned term comes last."""

@@ -6,11 +6,11 @@ side's own equation does not, that equation determines K, alpha and B_sp without
 
 from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.one_side import SIDES, fit_of_side, known_to
+from fitting.estimation.free_parameters import with_priors
+from fitting.estimation.one_side import fits_of_sides, with_known_priors
 from fitting.estimation.starting_values import sees_twist
-from fitting.uncertainty.measurement_noise import measurement_noise
+from fitting.uncertainty.one_side import leaves_only_noise
 from fitting.uncertainty.standard_errors import uncertainty
-from fitting.validation.account import excess
 from hdjax import OneSideModel, TwoInertiaModel
 
 
@@ -26,14 +26,14 @@ def better_side(found: Fit) -> Fit | None:
     model = found.model
     if not isinstance(model, TwoInertiaModel) or not sees_twist(found.stretches):
         return None
-    known = [(side, alone) for side in SIDES if (alone := known_to(side, model)) is not None]
-    fits = [fit_of_side(side, alone, found.stretches) for side, alone in known]
-    good = [one for one in fits if one is not None and _leaves_noise(one)]
+    fits = fits_of_sides(with_priors(TwoInertiaModel(model.drive), ()), found.stretches)
+    good = [one for one in fits if leaves_only_noise(one, found, most=RULES.excess)]
     if len(good) != 1:
         return None
-    own, other = (uncertainty(one).estimates["K"] for one in (found, good[0]))
+    side = with_known_priors(good[0], model.drive.priors)
+    own, other = (uncertainty(one).estimates["K"] for one in (found, side))
     agrees = other.ci95[0] <= own.value <= other.ci95[1]
-    return None if agrees and own.std <= other.std else good[0]
+    return None if agrees and own.std <= other.std else side
 
 
 def with_values_of(side: Fit, found: Fit) -> Fit:
@@ -57,7 +57,3 @@ def with_values_of(side: Fit, found: Fit) -> Fit:
 def source_of(side: Fit | None) -> str:
     """What the drive's parameters are from: the torque, or one side's equation."""
     return f"{side.model.equation} equation" if side is not None and isinstance(side.model, OneSideModel) else "torque"
-
-
-def _leaves_noise(found: Fit) -> bool:
-    return bool(excess(found, measurement_noise(found).covariance)[-1] < RULES.excess)

@@ -17,7 +17,8 @@ class Prior(NamedTuple):
     Attributes:
         path: its symbol.
         value: the most likely one [SI].
-        tolerance: standard deviation of its logarithm; infinite for a free parameter.
+        tolerance: standard deviation of its logarithm, or of its value where it may be negative; infinite for a free
+            parameter.
     """
 
     path: str

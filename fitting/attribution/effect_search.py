@@ -17,6 +17,7 @@ from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import lost
 from fitting.estimation.outliers import with_weights
 from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
+from fitting.uncertainty.one_side import leaves_only_noise, with_mesh_priors
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -55,11 +56,14 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Stud
     """
     first = hold if hold is not None else next(iter(data))
     training = data[first][0]
-    best = base_fit(model, training, halo=halo_for(training))
+    best, side = base_fit(model, training, halo=halo_for(training))
     data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
     study = Study(data, Setting(best.segmentation), load_late=delay_of_load(model, training))
     holds: list[Hold] = list(data) if hold is None else [hold]
-    trials = [attempt(best.model, study, h, hold_parameters=is_held(best)) for h in holds]
+    model = best.model
+    if side is not None and leaves_only_noise(side, best, most=RULES.excess):
+        model, study = with_mesh_priors(model, side), replace(study, side=side)
+    trials = [attempt(model, study, h, hold_parameters=is_held(best)) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
     finer = study.fine_enough(chosen.training)
     if finer is not study:

@@ -52,6 +52,7 @@ class Study:
         seed: of the surrogates for p-values.
         progress: receives messages.
         load_late: see [`hdjax.effects.Scales`][].
+        side: the fit of one side's equation that leaves only noise, where the base model's parameters are from it.
     """
 
     data: Data
@@ -59,6 +60,7 @@ class Study:
     seed: int = 0
     progress: Progress = silent
     load_late: float = 0.0
+    side: Fit | None = None
 
     def scales(self, stretches: Sequence[Stretch], model: Model) -> Scales:
         """Orders of magnitude of a motion, see [`fitting.estimation.scales.scales`][]."""

@@ -22,9 +22,8 @@ from fitting.attribution.support import (
 from fitting.discrepancy.learn import Unknown, learn_supported, share_of
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import half_log_determinant
-from fitting.uncertainty.measurement_noise import MeasurementNoise
+from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
-from fitting.validation.account import excess
 
 
 class Challenge(eqx.Module):

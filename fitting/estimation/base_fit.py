@@ -8,7 +8,7 @@ own states.
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.late_readings import with_load_moved
-from fitting.estimation.one_side import SIDES, fit_of_side, held_at, one_side_fit
+from fitting.estimation.one_side import held_at, one_side_fit, with_known_priors
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.scales import largest_torque
@@ -51,11 +51,22 @@ _LAGS = 20
 _FALSE_ALARM = 1e-3
 
 
-def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
-    """Fit a drive without effects, from starting values estimated from the data. The fit's `problem.model` holds these.
+class BaseFit(NamedTuple):
+    """The fit of a drive without effects.
 
-    Friction of the motor or an unlogged load may leave the objective without a minimum near the true parameters. Then
-    they are fixed (see [`is_held`][]).
+    Attributes:
+        fit: its `problem.model` holds the starting values. Friction or an unlogged load may leave the objective without
+            a minimum near the true parameters. Then they are fixed (see [`is_held`][]).
+        source: the fit that supplied fixed values: of one side's equation, or beside motor friction; None where nothing
+            was fixed, or by other means.
+    """
+
+    fit: Fit
+    source: Fit | None
+
+
+def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> BaseFit:
+    """Fit a drive without effects, from starting values estimated from the data.
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -66,14 +77,16 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: no starting values follow from the data.
     """
     training = without_glitches(training)
+    source = None
     if sees_twist(training):
-        best, start = _fit_of_twist(model, training, halo)
+        best, start, source = _fit_of_twist(model, training, halo)
     else:
         alone, beside, start = fits_of_starts(starting_models(model, training), training, halo)
         much = alone.objective - beside.objective > -np.log(_MUCH)
         best = held_beside(beside, start, training, halo) if much else alone
+        source = refitted_beside(best) if much else None
     if is_held(best):
-        return eqx.tree_at(lambda f: f.problem.model, best, start)
+        return BaseFit(eqx.tree_at(lambda f: f.problem.model, best, start), source)
     horizon = short_horizon(best.model, training)
     if not best.horizon <= 2 * horizon <= 4 * best.horizon:
         best = _refined(best, training, halo)
@@ -88,11 +101,12 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
             best.segmentation,
             start=Start(states=best.unknowns.states),
         )
-    return eqx.tree_at(lambda f: f.problem.model, best, start)
+    return BaseFit(eqx.tree_at(lambda f: f.problem.model, best, start), None)
 
 
-def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
-    """The fit over short horizons where the dynamic error was measured, and its starting model.
+def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model, Fit | None]:
+    """The fit over short horizons where the dynamic error was measured, its starting model, and the fit of one side at
+    whose values it is fixed.
 
     Encoders that are read rows apart leave no minimum near the true parameters. They are fixed at those of the fit
     without these rows.
@@ -102,28 +116,31 @@ def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple
         return _fit_of_both_angles(model, training, halo)
     # Taken as logged like this, or a fit without an encoder's delay would move the readings back.
     moved = [replace(s, experiment=replace(with_load_moved(s.experiment, late), load_moved=0.0)) for s in training]
-    best, start = _fit_of_both_angles(model, moved, halo)
-    return _held_at(best, best.model, training, halo), start
+    best, start, _ = _fit_of_both_angles(model, moved, halo)
+    return _held_at(best, best.model, training, halo), start, None
 
 
-def _fit_of_both_angles(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
+def _fit_of_both_angles(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model, Fit | None]:
     """[`_fit_of_twist`][] of encoders that are read together."""
     priors = ()
     if isinstance(model, TwoInertiaModel):
         # Free inertias would absorb what the base model lacks before the load's equation is used.
         priors = model.drive.priors
         model = with_priors(with_starting_inertias(model, training), ())
-    best, start = _coarse_fit(starting_models(model, training), training, halo)
-    if not is_held(best):
+    best, start, side = _coarse_fit(starting_models(model, training), training, halo)
+    if side is None:
         best = _beside_loads(best, training, halo)
     if priors:
         start = with_priors(start, priors)
         best = _with_inertias_free(best, priors)
-    return best, start
+        # The equation determines the stiffness only in proportion to that side's inertia.
+        side = with_known_priors(side, priors) if side is not None and is_held(best) else None
+    return best, start, side
 
 
-def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
-    """The best of the fits from each start, over horizons that suit the fastest of them; and its starting model."""
+def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Model, Fit | None]:
+    """The best of the fits from each start, over horizons that suit the fastest of them; its starting model; and the
+    fit of one side at whose values it is fixed."""
     # Equally short segments for all starts make their objectives comparable.
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
@@ -133,10 +150,10 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
         starts = sorted(starts, key=lambda s: fitted(s, strategy=Strategy(20, hold_parameters=True)).objective)
     best, begun = fitted(starts[0]), starts[0]
     if leaves_white_noise(best):
-        return best, begun
+        return best, begun, None
     driven = one_side_fit(best.model, training) if isinstance(best.model, TwoInertiaModel) else None
     if _contradicts(driven, best):
-        return _held_at(driven, best.model, training, halo), begun
+        return _held_at(driven, best.model, training, halo), begun, driven
     trials = [(fitted(s, strategy=Strategy(_TRIAL_STEPS)), s) for s in starts[1:]]
     for trial, start in sorted(trials, key=lambda pair: pair[0].objective):
         if trial.objective < best.objective + _HOPELESS:
@@ -144,8 +161,8 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
             if other.objective < best.objective:
                 best, begun = other, start
     if _contradicts(driven, best):
-        best = _held_at(driven, best.model, training, halo)
-    return best, begun
+        return _held_at(driven, best.model, training, halo), begun, driven
+    return best, begun, None
 
 
 def _fitted(
@@ -235,23 +252,6 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     )
     states = initial_states(best.model, segmentation.of(as_followed(best)))
     return fit(best.model, training, paths, segmentation, start=Start(states=states))
-
-
-def fit_behind_fixed_values(found: Fit) -> Fit | None:
-    """The fit that supplied a base fit's fixed values: of one side's equation, or beside motor friction. None where
-    nothing was fixed, or by other means."""
-    if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
-        return None
-    if not sees_twist(found.stretches):
-        return refitted_beside(found)
-    for side in SIDES:
-        driven = fit_of_side(side, with_priors(found.model, ()), found.stretches)
-        if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
-            continue
-        # The fit determines the stiffness only in proportion to that side's inertia.
-        known = tuple(p for p in found.model.drive.priors if p.path in side.scaled_by and np.isfinite(p.tolerance))
-        return fit_of_side(side, with_priors(found.model, known), found.stretches) if known else driven
-    return None
 
 
 def need_double_precision() -> None:

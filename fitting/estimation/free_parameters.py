@@ -113,8 +113,14 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
     ]
     priors = {p.path: p for p in model.drive.priors} if isinstance(model.drive, Drive) else {}
     known_before = [priors.get(p, Prior(p, 1.0, math.inf)) for p in paths]
-    numbers = units, [math.log(p.value) for p in known_before], [1.0 / p.tolerance for p in known_before]
+    centres, precisions = zip(*map(_of_prior, known_before, logarithmic, units), strict=True) if paths else ((), ())
+    numbers = units, centres, precisions
     return FreeParameters(tuple(paths), logarithmic, *(jnp.asarray(np.array(n, dtype=float)) for n in numbers))
+
+
+def _of_prior(prior: Prior, positive: bool, unit: float) -> tuple[float, float]:
+    """Mean and precision of an entry of the vector."""
+    return (math.log(prior.value), 1.0 / prior.tolerance) if positive else (prior.value / unit, unit / prior.tolerance)
 
 
 def as_they_are(model: Model, paths: Sequence[str]) -> tuple[FreeParameters, Float[Array, " parameters"]]:
@@ -133,7 +139,7 @@ def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:
 def base_paths(model: Model) -> tuple[str, ...]:
     """Fitted parameters of a drive without effects."""
     if isinstance(model.drive, Drive):
-        return (*MESH, *(prior.path for prior in model.drive.priors))
+        return (*MESH, *(prior.path for prior in model.drive.priors if prior.path not in MESH))
     return ("mu", "omega_0", "alpha", "gain")
 
 

@@ -14,13 +14,15 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
-from fitting.estimation.starting_values import starts_of_equation
+from fitting.estimation.starting_values import shaft_torques, start_beside_torques, starts_of_equation
 from hdjax import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, PiecewisePolynomial, TwoInertiaModel
+from hdjax.drive import Prior
 
 SIDES: tuple[type[OneSideModel], ...] = (MotorDrivenModel, LoadDrivenModel)
 
@@ -28,12 +30,28 @@ SIDES: tuple[type[OneSideModel], ...] = (MotorDrivenModel, LoadDrivenModel)
 def one_side_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
     """The fit of the side whose equation describes the twist better; None where neither gives starting values.
 
+    Arguments as in [`fits_of_sides`][].
+    """
+    return min(fits_of_sides(model, stretches), key=lambda found: found.objective, default=None)
+
+
+def fits_of_sides(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> list[Fit]:
+    """Fits of both sides' equations: alone, or beside gravity and friction on the side where these explain most of what
+    it leaves. They are then part of the data.
+
     Args:
         model: the base model; its stiffness and damping are only placeholders, and it has no priors.
         stretches: the data.
     """
-    fits = [found for side in SIDES if (found := fit_of_side(side, model, stretches)) is not None]
-    return min(fits, key=lambda found: found.objective, default=None)
+    fits = []
+    for side in SIDES:
+        beside = start_beside_torques(side.equation, model, stretches)
+        if beside is None:
+            fits.append(fit_of_side(side, model, stretches))
+        else:
+            start, strengths = beside
+            fits.append(_best_fit(side(model.drive), [start], [_driven(side, model, s, strengths) for s in stretches]))
+    return [found for found in fits if found is not None]
 
 
 def fit_of_side(side: type[OneSideModel], model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
@@ -47,31 +65,34 @@ def fit_of_side(side: type[OneSideModel], model: TwoInertiaModel, stretches: Seq
     Returns:
         The best of the fits from all starts of the equation; None where there are none.
     """
-    driven = tuple(_driven(side, stretch) for stretch in stretches)
-    starts = [
-        side(model.drive).replace({p: start.get(p) for p in MESH})
-        for start in starts_of_equation(side.equation, model, stretches)
-    ]
+    starts = starts_of_equation(side.equation, model, stretches)
+    return _best_fit(side(model.drive), starts, [_driven(side, model, stretch) for stretch in stretches])
+
+
+def _best_fit(equation: OneSideModel, starts: Sequence[Model], driven: Sequence[Stretch]) -> Fit | None:
     if not starts:
         return None
+    models = [equation.replace({p: start.get(p) for p in MESH}) for start in starts]
     # Equally short segments for all starts make their objectives comparable.
-    horizon = min(short_horizon(start, driven) for start in starts)
-    coarse = [_fitted(start, driven, horizon) for start in starts]
+    horizon = min(short_horizon(start, driven) for start in models)
+    coarse = [_fitted(start, driven, horizon) for start in models]
     best = min(coarse, key=lambda found: found.objective)
     return _fitted(best.model, driven, short_horizon(best.model, driven))
 
 
-def known_to(side: type[OneSideModel], model: TwoInertiaModel) -> TwoInertiaModel | None:
-    """The base model with priors for one side's equation; None where a value that scales its K is unknown.
+def with_known_priors(found: Fit, priors: Sequence[Prior]) -> Fit:
+    """The fit of one side with those priors that scale its stiffness and have a finite tolerance.
 
     Args:
-        side: the equation.
-        model: of the drive, with its priors.
+        found: the fit without priors.
+        priors: of the drive.
     """
-    priors = tuple(p for p in model.drive.priors if p.path in side.scaled_by)
-    if any(np.isinf(p.tolerance) for p in priors):
-        return None
-    return with_priors(TwoInertiaModel(model.drive), priors)
+    assert isinstance(found.model, OneSideModel)
+    known = tuple(p for p in priors if p.path in found.model.scaled_by and np.isfinite(p.tolerance))
+    if not known:
+        return found
+    model, start = with_priors(found.model, known), Start(found.covariance, found.unknowns.states)
+    return fit(model, found.stretches, base_paths(model), found.segmentation, start=start)
 
 
 def held_at(model: Model, found: Fit) -> Fit:
@@ -96,19 +117,43 @@ def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
     return fit(model, driven, base_paths(model), segmentation)
 
 
-def _driven(side: type[OneSideModel], stretch: Stretch) -> Stretch:
+def _driven(
+    side: type[OneSideModel],
+    model: TwoInertiaModel,
+    stretch: Stretch,
+    strengths: Float[np.ndarray, " torques"] | None = None,
+) -> Stretch:
     """A stretch with the acceleration of the motor over N in place of the motor torque, or with that of the load in
-    place of the load torque."""
+    place of the load torque; and with shaft torques of given strengths on the side of the equation."""
     # Imported here: most logs do not need it.
     from scipy.interpolate import CubicSpline
 
     whole = stretch.experiment
-    turn, twist = whole.measured[:, 0], whole.measured[:, 1]
-    angle = turn if side is MotorDrivenModel else turn - twist
+    turn, load = whole.measured[:, 0], whole.measured[:, 0] - whole.measured[:, 1]
+    by_motor = side is MotorDrivenModel
     known = np.ones(len(whole), dtype=bool) if whole.weight is None else whole.weight > 0
-    acceleration = CubicSpline(whole.time[known], angle[known])(whole.time, 2)
-    slope = np.append(np.diff(acceleration) / np.diff(whole.time), 0.0)
-    pieces = jnp.asarray(np.stack([acceleration, slope], axis=1))
-    forcing = {"torque" if side is MotorDrivenModel else "load_torque": PiecewisePolynomial(whole.torque.knots, pieces)}
+    acceleration = CubicSpline(whole.time[known], (turn if by_motor else load)[known])(whole.time, 2)
+    forcing = _through(whole.torque, whole.time, acceleration)
+    torque, load_torque = (forcing, whole.load_torque) if by_motor else (whole.torque, forcing)
+    if strengths is not None:
+        shaft = load if by_motor else turn * float(model.drive.N)
+        added = _through(whole.torque, whole.time, shaft_torques(shaft, whole.time_step) @ strengths)
+        torque, load_torque = (torque, _sum(load_torque, added)) if by_motor else (_sum(torque, added), load_torque)
     own = {"measured": whole.measured[:, 1:], "outputs": ("dynamic_error",), "motor_angle": None}
-    return Stretch(replace(whole, **forcing, **own), stretch.start, stretch.stop)
+    return Stretch(replace(whole, torque=torque, load_torque=load_torque, **own), stretch.start, stretch.stop)
+
+
+def _through(like: PiecewisePolynomial, time: np.ndarray, values: np.ndarray) -> PiecewisePolynomial:
+    """Straight lines through values at the samples, on the knots of another signal."""
+    slope = np.append(np.diff(values) / np.diff(time), 0.0)
+    return PiecewisePolynomial(like.knots, jnp.asarray(np.stack([values, slope], axis=1)))
+
+
+def _sum(one: PiecewisePolynomial | None, other: PiecewisePolynomial) -> PiecewisePolynomial:
+    """The sum of a signal, if there is one, and straight lines on the same knots."""
+    if one is None:
+        return other
+    coefficients = np.array(one.coefficients)
+    coefficients = np.pad(coefficients, ((0, 0), (0, max(0, 2 - coefficients.shape[1]))))
+    coefficients[:, :2] += np.asarray(other.coefficients)
+    return PiecewisePolynomial(one.knots, jnp.asarray(coefficients))

@@ -13,6 +13,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from fitting.errors import DataError
 from fitting.estimation import weak_form
@@ -23,6 +24,9 @@ from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 
 # Starts whose log stiffness differs by less than this end in the same minimum.
 _DISTINCT = 0.1
+# Torques on a shaft explain most of an equation's error where they leave less than this share, assumed: as for other
+# causes of a wrong minimum.
+_MUCH = 0.5
 
 
 def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
@@ -72,6 +76,39 @@ def starts_of_equation(side: str, model: TwoInertiaModel, stretches: Sequence[St
     empty. Other arguments as in [`starting_models`][]."""
     found = (_estimates(model, stretches, blind=blind, equations=(side,)) for blind in (False, True))
     return _distinct(model, list(itertools.chain(*found)))
+
+
+def start_beside_torques(
+    side: str, model: TwoInertiaModel, stretches: Sequence[Stretch]
+) -> tuple[Model, Float[np.ndarray, " torques"]] | None:
+    """Starting values from one side's equation with gravity and friction on that side, and the strengths of these
+    torques, see [`shaft_torques`][]; None where they do not explain most of what the equation alone leaves.
+
+    Arguments as in [`starts_of_equation`][].
+    """
+    found = []
+    for width, blind in itertools.product(WIDTHS, (False, True)):
+        solved = _solved(model, stretches, width, side, blind=blind, beside=True)
+        values = None if solved is None else _values(model, solved[0], stretches, side)
+        if solved is not None and values is not None:
+            found.append((solved[1], width, blind, values, solved[0][3:]))
+    if not found:
+        return None
+    missed, width, blind, values, strengths = min(found, key=lambda each: each[0])
+    alone = _solved(model, stretches, width, side, blind=blind)
+    assert alone is not None
+    return (model.replace(values), strengths) if missed < _MUCH * alone[1] else None
+
+
+def shaft_torques(angle: Float[np.ndarray, " samples"], step: float) -> Float[np.ndarray, "samples torques"]:
+    """Unit torques that may act on a shaft as it moves: gravity or one ripple a turn, Coulomb and viscous friction.
+
+    Args:
+        angle: of the shaft at each sample [rad].
+        step: time between samples [s].
+    """
+    rate = np.gradient(angle, step)
+    return np.stack([np.sin(angle), np.cos(angle), np.sign(rate), rate], axis=1)
 
 
 def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Model:
@@ -178,20 +215,26 @@ def _weak_form(
     model: Model, stretches: Sequence[Stretch], width: int, equation: str, *, blind: bool = False
 ) -> dict[str, float] | None:
     """Starting values of the base parameters; None where the stiffness is not positive."""
-    rows, right = [], []
-    for stretch in stretches:
-        if len(stretch) < 3 * width:
-            continue
-        a, b = _rows(model, stretch, width, equation, blind=blind)
-        rows.append(a)
-        right.append(b)
-    if not rows:
+    found = _solved(model, stretches, width, equation, blind=blind)
+    return None if found is None else _values(model, found[0], stretches, equation)
+
+
+def _solved(
+    model: Model, stretches: Sequence[Stretch], width: int, equation: str, *, blind: bool, beside: bool = False
+) -> tuple[np.ndarray, float] | None:
+    """Solution of a weak form, and its rms error; None for too few data. Other arguments as in [`_rows`][]."""
+    parts = [
+        _rows(model, stretch, width, equation, blind=blind, beside=beside)
+        for stretch in stretches
+        if len(stretch) >= 3 * width
+    ]
+    if not parts:
         return None
-    a, b = np.concatenate(rows), np.concatenate(right)
+    a, b = (np.concatenate(column) for column in zip(*parts, strict=True))
     norm = np.linalg.norm(a, axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0] / norm
-    return _values(model, solution, stretches, equation)
+    return solution, float(np.sqrt(np.mean((b - a @ solution) ** 2)))
 
 
 def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str) -> dict[str, float] | None:
@@ -213,8 +256,19 @@ def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], eq
     return {"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)}
 
 
-def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Weak-form regressors (stiffness, cubic, damping, and gain of a reduced drive) and right-hand side."""
+def _rows(
+    model: Model, stretch: Stretch, width: int, equation: str, *, blind: bool, beside: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weak-form regressors (stiffness, cubic, damping, and gain of a reduced drive) and right-hand side.
+
+    Args:
+        model: supplies the inertias.
+        stretch: the data.
+        width: samples in the support of a test function.
+        equation: of the dynamic "error", of the "load" or of the "motor".
+        blind: whether the test functions are insensitive to a constant torque.
+        beside: whether further regressors are [`shaft_torques`][] on the side of the equation.
+    """
     experiment = stretch.experiment
     part = slice(stretch.start, stretch.stop)
     dt = experiment.time_step
@@ -239,7 +293,11 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: b
             right = float(drive.J_l) * momentum - against(T_l, tests)
         else:
             right = N * float(drive.k_T) * against(u, tests) - N**2 * float(drive.J_m) * momentum
-        return np.stack([spring, cubic, damper], axis=1), right
+        columns = [spring, cubic, damper]
+        if beside:
+            shaft, sign = (angle, -1.0) if equation == "load" else (N * angle, N * float(drive.k_T))
+            columns += [-sign * against(torque, tests) for torque in shaft_torques(shaft, dt).T]
+        return np.stack(columns, axis=1), right
     right = -against(x, curvatures)
     if isinstance(model.drive, Drive):
         forcing = u * float(model.drive.k_T) / (float(model.drive.N) * float(model.drive.J_m)) - T_l / float(

@@ -89,6 +89,11 @@ def measurement_noise(found: Fit) -> MeasurementNoise:
     return MeasurementNoise(_noise_beside(found), (found,))
 
 
+def excess(fit: Fit, noise: Float[Array, "outputs outputs"]) -> Float[np.ndarray, " outputs"]:
+    """Rms residual of each output over its measurement noise; 1 for pure noise."""
+    return np.sqrt(np.diag(np.asarray(fit.covariance)) / np.diag(np.asarray(noise)))
+
+
 def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     """Covariance of the outputs' measurement noise: the residual when each short piece of the log has a free initial
     state.

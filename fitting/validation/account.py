@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.engines import why_not
@@ -108,8 +107,3 @@ def free_runs(
     if not stretches:
         return ()
     return free_run(fit.model, stretches, covariance=noise, halo=halo, substeps=fit.substeps, like=fit)
-
-
-def excess(fit: Fit, noise: Float[Array, "outputs outputs"]) -> Float[np.ndarray, " outputs"]:
-    """Rms residual of each output over its measurement noise; 1 for pure noise."""
-    return np.sqrt(np.diag(np.asarray(fit.covariance)) / np.diag(np.asarray(noise)))

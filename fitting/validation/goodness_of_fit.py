@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, as_logged
 from fitting.estimation.outliers import left_out
-from fitting.validation.account import Account, excess
+from fitting.uncertainty.measurement_noise import excess
+from fitting.validation.account import Account
 
 
 class Goodness(eqx.Module):

@@ -21,7 +21,7 @@ def base_trial_and_study():
     experiment = rig.reduced_experiment(3000, noise=2e-4, rms=30.0, friction=SHARP, substeps=60)
     data: Data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
-    base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
+    base = base_fit(rig.reduced_model(), training, halo=halo_for(training)).fit
     study = Study(data, Setting(base.segmentation))
     return attempt(base.model, study, HOLD), study
 

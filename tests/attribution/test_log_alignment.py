@@ -47,7 +47,7 @@ def fitted_to_phases() -> Callable[..., TrialAndStudy]:
     def fitted(*phases: float | None) -> TrialAndStudy:
         data: Data = {h: split([experiment(i, h, phase) for i, phase in enumerate(phases)]) for h in HOLDS}
         training = data[HOLDS[0]][0]
-        found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
+        found = base_fit(rig.reduced_model(), training, halo=halo_for(training)).fit
         study = Study(data, Setting(found.segmentation))
         return attempt(found.model, study, HOLDS[0]), study
 

@@ -39,7 +39,7 @@ def verdicts():
     experiment = rig.reduced_experiment(2400, noise=1e-3, bias=0.5, quadratic=0.3)
     data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
-    base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
+    base = base_fit(rig.reduced_model(), training, halo=halo_for(training)).fit
     study = Study(data, Setting(base.segmentation))
     before = attempt(base.model, study, HOLD)
     standing = Standing(before, before, measurement_noise(before.training))

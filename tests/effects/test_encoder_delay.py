@@ -41,7 +41,7 @@ def log_with_late_encoder(side: int, steps: int) -> Stretch:
 def test_encoder_delay_is_estimated_from_a_log(form: type[EncoderDelay], side: int, steps: int):
     """A delay within a row, and one of several rows, a tenth of a natural period."""
     stretch = log_with_late_encoder(side, steps)
-    base = base_fit(MODEL, (stretch,))
+    base = base_fit(MODEL, (stretch,)).fit
     model = base.model.with_effects(form(delay=max(1e-5, form.side * delay_of_load(MODEL, (stretch,)))))
     paths = (*base_paths(base.model), *effect_paths(model.effects[0]))
     segmentation = dataclasses.replace(base.segmentation, halo=5)

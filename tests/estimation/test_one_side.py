@@ -74,14 +74,14 @@ def test_motor_driven_residual_grows_with_a_wrong_stiffness(stretches):
 
 
 def test_base_fit_fixes_parameters_at_the_motor_driven_fit(stretches):
-    found = base_fit(model_of(WITH_FRICTION), stretches)
+    found = base_fit(model_of(WITH_FRICTION), stretches).fit
     assert is_held(found)
     assert float(found.model.get("K")) == pytest.approx(WITH_FRICTION.K, rel=0.01)
     assert fit_behind_fixed_values(found) is not None
 
 
 def test_base_fit_without_friction_fixes_no_parameter():
-    found = base_fit(model_of(SMOOTH), stretches_of(SMOOTH))
+    found = base_fit(model_of(SMOOTH), stretches_of(SMOOTH)).fit
     assert not is_held(found) and fit_behind_fixed_values(found) is None
     assert float(found.model.get("K")) == pytest.approx(SMOOTH.K, rel=0.01)
 
@@ -109,7 +109,7 @@ def test_load_driven_fit_recovers_stiffness_under_load_friction():
 def test_base_fit_fixes_parameters_at_the_load_driven_fit(share):
     """A load that rubs, or hardly moves at all."""
     joint = dataclasses.replace(WITH_LOAD_FRICTION, load_friction=share * SMOOTH.rms * SMOOTH.N)
-    found = base_fit(model_of(joint), stretches_of(joint))
+    found = base_fit(model_of(joint), stretches_of(joint)).fit
     assert is_held(found)
     assert float(found.model.get("K")) == pytest.approx(joint.K, rel=0.001)
     behind = fit_behind_fixed_values(found)

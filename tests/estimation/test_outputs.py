@@ -71,7 +71,7 @@ def motor_of_rubbing(rubbing: joints.Joint) -> tuple[Stretch, ...]:
 @pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
 def test_base_fit_recovers_stiffness_and_inertias_from_any_outputs(sensors: tuple[str, ...], free: bool):
     stretches = stretches_of(JOINT, sensors)
-    found = base_fit(model_of(stretches, free=free), stretches)
+    found = base_fit(model_of(stretches, free=free), stretches).fit
     estimates = uncertainty(found).estimates
     assert not is_held(found) and estimates["K"].std < 1e-3 * JOINT.K
     for path in ("K", "B_sp", *(("J_m", "J_l") if free else ())):
@@ -79,7 +79,7 @@ def test_base_fit_recovers_stiffness_and_inertias_from_any_outputs(sensors: tupl
 
 
 def test_fit_without_twist_is_unbiased_under_motor_friction(motor_of_rubbing: tuple[Stretch, ...]):
-    found = base_fit(model_of(motor_of_rubbing, free=True), motor_of_rubbing)
+    found = base_fit(model_of(motor_of_rubbing, free=True), motor_of_rubbing).fit
     told = fit_behind_fixed_values(found)
     assert is_held(found) and told is not None
     estimates = uncertainty(told).estimates

@@ -35,7 +35,7 @@ def stretches() -> tuple[Stretch, ...]:
 
 
 def fitted(stretches: tuple[Stretch, ...], *priors: Prior) -> Fit:
-    return base_fit(model_of(*priors), stretches)
+    return base_fit(model_of(*priors), stretches).fit
 
 
 def test_free_inertias_are_recovered(stretches):

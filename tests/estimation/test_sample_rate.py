@@ -28,7 +28,7 @@ def experiments(seed: int, *, rate_std: float, factor: float = 1.0, pieces=None)
 
 
 def fitted(*several: Experiment) -> Fit:
-    return base_fit(MODEL, whole(several))
+    return base_fit(MODEL, whole(several)).fit
 
 
 @pytest.fixture(scope="module")

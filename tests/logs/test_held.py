@@ -128,7 +128,7 @@ def test_fit_with_a_held_encoder_recovers_the_parameters():
     tables = {"drive": {"reduction_ratio": rig.N, "motor_inertia": rig.J_M, "load_inertia": rig.J_L}}
     assert not [f for f in examine(ready, drive_of(tables, log.path)) if f.severity == "refusal"]
     model = TwoInertiaModel(Drive(N=rig.N, J_m=rig.J_M, J_l=rig.J_L, K=1.0))
-    found = base_fit(model, whole(experiments_from_log(ready, hold="zero-order", N=rig.N)))
+    found = base_fit(model, whole(experiments_from_log(ready, hold="zero-order", N=rig.N))).fit
     estimates = uncertainty(found, torque_noise=False).estimates
     for path, truth in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}.items():
         assert abs(estimates[path].value - truth) < 4 * estimates[path].std, path

@@ -1,0 +1,51 @@
+"""What the equation of one side says about K, alpha and B_sp, where it leaves only noise.
+
+Friction of one side does not enter the equation of the other. So it holds whatever law that friction has.
+"""
+
+import numpy as np
+
+from fitting.estimation.estimate import Fit
+from fitting.estimation.free_parameters import MESH, with_priors
+from fitting.uncertainty.measurement_noise import excess, measurement_noise
+from fitting.uncertainty.standard_errors import uncertainty
+from hdjax import Model, OneSideModel, TwoInertiaModel
+from hdjax.drive import Prior
+
+
+def leaves_only_noise(side: Fit, found: Fit, *, most: float) -> bool:
+    """Whether one side's equation determines K, leaves less than a model of the drive, and no more than noise.
+
+    Args:
+        side: the fit of the equation.
+        found: the fit of the model, with its priors.
+        most: times the noise.
+    """
+    assert isinstance(side.model, OneSideModel) and isinstance(found.model, TwoInertiaModel)
+    unknown = {prior.path for prior in found.model.drive.priors if np.isinf(prior.tolerance)}
+    if unknown.intersection(side.model.scaled_by) or side.principal_std >= found.principal_std:
+        return False
+    return bool(excess(side, measurement_noise(side).covariance)[-1] < most)
+
+
+def with_mesh_priors(model: Model, side: Fit) -> Model:
+    """The model with what one side's equation says as priors of K, alpha and B_sp.
+
+    While a model lacks something, its residual has little weight, and the priors keep the parameters where they are.
+    Once it leaves only noise, its own information counts.
+
+    Args:
+        model: of the drive.
+        side: the fit of the equation.
+    """
+    assert isinstance(model, TwoInertiaModel)
+    known = uncertainty(side).estimates
+    spread = {path: known[path].std / (1.0 if path == "alpha" else known[path].value) for path in MESH}
+    return with_priors(model, (*model.drive.priors, *(Prior(p, known[p].value, spread[p]) for p in MESH)))
+
+
+def without_mesh_priors(model: Model) -> Model:
+    """The model with the priors of its drive file alone."""
+    if not isinstance(model, TwoInertiaModel):
+        return model
+    return with_priors(model, tuple(prior for prior in model.drive.priors if prior.path not in MESH))
