@@ -31,6 +31,7 @@ class Joint:
         rms: of the motor torque [N m].
         load_friction: Coulomb torque on the load [N m], which builds up over `bend` (Dahl).
         bend: load angle [rad].
+        gravity: largest torque of gravity on the load [N m].
     """
 
     N: float
@@ -44,6 +45,7 @@ class Joint:
     rms: float = 1.0
     load_friction: float = 0.0
     bend: float = 1e-3
+    gravity: float = 0.0
 
     @property
     def omega_0(self) -> float:
@@ -67,7 +69,7 @@ def motion_of(joint: Joint, torque: np.ndarray, *, step: float = STEP, substeps:
         x, v = theta_m / width - theta_l, omega_m / width - omega_l
         tau = joint.K * (x + joint.alpha * x**3) + joint.B_sp * v
         friction = joint.coulomb * np.tanh(omega_m / rest) + joint.viscous * omega_m
-        held = joint.load_friction * z / joint.bend
+        held = joint.load_friction * z / joint.bend + joint.gravity * np.sin(theta_l)
         sliding = omega_l - abs(omega_l) * z / joint.bend
         return omega_m, omega_l, (T - friction - tau / width) / joint.J_m, (tau - held) / joint.J_l, sliding
 

@@ -222,7 +222,8 @@ def _weak_form(
 def _solved(
     model: Model, stretches: Sequence[Stretch], width: int, equation: str, *, blind: bool, beside: bool = False
 ) -> tuple[np.ndarray, float] | None:
-    """Solution of a weak form, and its rms error; None for too few data. Other arguments as in [`_rows`][]."""
+    """Solution of a weak form, and the share of the right-hand side's rms value that it leaves; None for too few data.
+    Other arguments as in [`_rows`][]."""
     parts = [
         _rows(model, stretch, width, equation, blind=blind, beside=beside)
         for stretch in stretches
@@ -234,7 +235,7 @@ def _solved(
     norm = np.linalg.norm(a, axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0] / norm
-    return solution, float(np.sqrt(np.mean((b - a @ solution) ** 2)))
+    return solution, float(np.linalg.norm(b - a @ solution) / max(np.linalg.norm(b), 1e-300))
 
 
 def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str) -> dict[str, float] | None:

@@ -59,7 +59,8 @@ def report_dict(
     after = no_account()
     if isinstance(outcome, Loop):
         after = account_dict(outcome.after, units, x_max)
-        widen_by_ties(after, outcome, x_max)
+        if outcome.parameters_from == "torque":
+            widen_by_ties(after, outcome, x_max)
     report = {
         "schema": SCHEMA,
         "version": version("hdjax"),

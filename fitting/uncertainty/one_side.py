@@ -17,11 +17,13 @@ def leaves_only_noise(side: Fit, found: Fit, *, most: float) -> bool:
     """Whether one side's equation determines K, leaves less than a model of the drive, and no more than noise.
 
     Args:
-        side: the fit of the equation.
+        side: the fit of the equation; a fit of another model does not count.
         found: the fit of the model, with its priors.
         most: times the noise.
     """
-    assert isinstance(side.model, OneSideModel) and isinstance(found.model, TwoInertiaModel)
+    if not isinstance(side.model, OneSideModel):
+        return False
+    assert isinstance(found.model, TwoInertiaModel)
     unknown = {prior.path for prior in found.model.drive.priors if np.isinf(prior.tolerance)}
     if unknown.intersection(side.model.scaled_by) or side.principal_std >= found.principal_std:
         return False

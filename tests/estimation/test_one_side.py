@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import joints
-from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
+from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
-from fitting.estimation.one_side import fit_of_side, held_at
+from fitting.estimation.one_side import fit_of_side, fits_of_sides, held_at
+from fitting.estimation.starting_values import start_beside_torques
 from fitting.fit_drive import fit_only
 from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
@@ -20,9 +21,8 @@ from hdjax import Drive, LoadDrivenModel, MotorDrivenModel, TwoInertiaModel
 
 SMOOTH = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
 WITH_FRICTION = joints.with_friction(SMOOTH, 0.5, 0.4)
-
-
 WITH_LOAD_FRICTION = dataclasses.replace(SMOOTH, load_friction=1.2 * SMOOTH.rms * SMOOTH.N, bend=3e-3)
+HANGING = dataclasses.replace(WITH_FRICTION, gravity=1.5)
 
 
 def model_of(joint: joints.Joint) -> TwoInertiaModel:
@@ -74,15 +74,15 @@ def test_motor_driven_residual_grows_with_a_wrong_stiffness(stretches):
 
 
 def test_base_fit_fixes_parameters_at_the_motor_driven_fit(stretches):
-    found = base_fit(model_of(WITH_FRICTION), stretches).fit
+    found, side = base_fit(model_of(WITH_FRICTION), stretches)
     assert is_held(found)
     assert float(found.model.get("K")) == pytest.approx(WITH_FRICTION.K, rel=0.01)
-    assert fit_behind_fixed_values(found) is not None
+    assert side is not None and isinstance(side.model, MotorDrivenModel)
 
 
 def test_base_fit_without_friction_fixes_no_parameter():
-    found = base_fit(model_of(SMOOTH), stretches_of(SMOOTH)).fit
-    assert not is_held(found) and fit_behind_fixed_values(found) is None
+    found, side = base_fit(model_of(SMOOTH), stretches_of(SMOOTH))
+    assert not is_held(found) and side is None
     assert float(found.model.get("K")) == pytest.approx(SMOOTH.K, rel=0.01)
 
 
@@ -109,11 +109,10 @@ def test_load_driven_fit_recovers_stiffness_under_load_friction():
 def test_base_fit_fixes_parameters_at_the_load_driven_fit(share):
     """A load that rubs, or hardly moves at all."""
     joint = dataclasses.replace(WITH_LOAD_FRICTION, load_friction=share * SMOOTH.rms * SMOOTH.N)
-    found = base_fit(model_of(joint), stretches_of(joint)).fit
+    found, side = base_fit(model_of(joint), stretches_of(joint))
     assert is_held(found)
     assert float(found.model.get("K")) == pytest.approx(joint.K, rel=0.001)
-    behind = fit_behind_fixed_values(found)
-    assert behind is not None and isinstance(behind.model, LoadDrivenModel)
+    assert side is not None and isinstance(side.model, LoadDrivenModel)
 
 
 def test_report_states_intervals_from_the_motor_equation():
@@ -123,3 +122,46 @@ def test_report_states_intervals_from_the_motor_equation():
     low, high = report["before"]["parameters"]["K"]["ci95"]
     assert low < WITH_LOAD_FRICTION.K < high and high - low < 0.1 * WITH_LOAD_FRICTION.K
     assert "load does not move as the logged torque predicts" in " ".join(report["meaning"])
+
+
+@pytest.fixture(scope="module")
+def hanging() -> tuple[Stretch, ...]:
+    return stretches_of(HANGING)
+
+
+def test_load_equation_beside_gravity_recovers_stiffness_under_motor_friction(hanging):
+    """Neither equation holds alone: gravity is not logged, and the motor rubs."""
+    found, side = base_fit(model_of(HANGING), hanging)
+    assert is_held(found) and side is not None and isinstance(side.model, MotorDrivenModel)
+    for path, estimate in uncertainty(side).estimates.items():
+        assert abs(estimate.value - getattr(HANGING, path)) < 4.0 * estimate.std, (path, estimate)
+        assert float(found.model.get(path)) == estimate.value
+    assert uncertainty(side).estimates["K"].std < 0.01 * HANGING.K
+    alone = fit_of_side(MotorDrivenModel, model_of(HANGING), hanging)
+    assert alone is None or alone.principal_std > 3.0 * side.principal_std
+
+
+def test_strengths_of_shaft_torques_are_those_of_gravity(hanging):
+    beside = start_beside_torques("load", model_of(HANGING), hanging)
+    assert beside is not None
+    start, (sine, cosine, coulomb, viscous) = beside
+    assert sine == pytest.approx(-HANGING.gravity, rel=0.01)
+    assert float(start.get("K")) == pytest.approx(HANGING.K, rel=0.01)
+    speed = np.std(np.gradient(hanging[0].experiment.measured[:, 0], joints.STEP))
+    assert max(abs(cosine), abs(coulomb), abs(viscous) * speed) < 0.02 * HANGING.gravity
+
+
+def test_torques_of_a_shaft_add_to_a_logged_torque():
+    """Friction of the motor, given as a shaft torque, leaves the motor's equation as the load's."""
+    beside = start_beside_torques("motor", model_of(WITH_FRICTION), stretches_of(WITH_FRICTION))
+    assert beside is not None
+    _, (_, _, coulomb, viscous) = beside
+    assert coulomb == pytest.approx(-WITH_FRICTION.coulomb, rel=0.05)
+    assert viscous == pytest.approx(-WITH_FRICTION.viscous, rel=0.05)
+    fits = {type(f.model): f for f in fits_of_sides(model_of(WITH_FRICTION), stretches_of(WITH_FRICTION))}
+    assert float(fits[LoadDrivenModel].model.get("K")) == pytest.approx(WITH_FRICTION.K, rel=0.05)
+
+
+@pytest.mark.parametrize("side", ["load", "motor"])
+def test_no_torque_is_added_where_an_equation_holds_alone(side):
+    assert start_beside_torques(side, model_of(SMOOTH), stretches_of(SMOOTH)) is None
