@@ -7,7 +7,7 @@ side's own equation does not, that equation determines K, alpha and B_sp without
 from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.free_parameters import with_priors
-from fitting.estimation.one_side import fits_of_sides, with_known_priors
+from fitting.estimation.one_side import fits_of_sides, stiffness_error, with_known_priors
 from fitting.estimation.starting_values import sees_twist
 from fitting.uncertainty.one_side import leaves_only_noise
 from fitting.uncertainty.standard_errors import uncertainty
@@ -15,10 +15,8 @@ from hdjax import OneSideModel, TwoInertiaModel
 
 
 def better_side(found: Fit) -> Fit | None:
-    """The fit of the only side whose own equation leaves no more than noise, if that excludes the model's K or
-    determines it better.
-
-    Two such sides would contradict each other in the inertias, since together they are the drive without effects.
+    """The fit of one side whose own equation leaves only noise, if that excludes the model's K or determines it better;
+    None also where both sides leave only noise and contradict each other, since an inertia is then wrong.
 
     Args:
         found: the fit of a model that leaves more than noise.
@@ -28,12 +26,12 @@ def better_side(found: Fit) -> Fit | None:
         return None
     fits = fits_of_sides(with_priors(TwoInertiaModel(model.drive), ()), found.stretches)
     good = [one for one in fits if leaves_only_noise(one, found, most=RULES.excess)]
-    if len(good) != 1:
+    sides = [with_known_priors(one, model.drive.priors) for one in sorted(good, key=stiffness_error)]
+    own, *told = (uncertainty(one).estimates["K"] for one in (found, *sides))
+    if not told or max(e.ci95[0] for e in told) > min(e.ci95[1] for e in told):
         return None
-    side = with_known_priors(good[0], model.drive.priors)
-    own, other = (uncertainty(one).estimates["K"] for one in (found, side))
-    agrees = other.ci95[0] <= own.value <= other.ci95[1]
-    return None if agrees and own.std <= other.std else side
+    agrees = told[0].ci95[0] <= own.value <= told[0].ci95[1]
+    return None if agrees and own.std <= told[0].std else sides[0]
 
 
 def with_values_of(side: Fit, found: Fit) -> Fit:

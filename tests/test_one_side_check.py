@@ -29,9 +29,9 @@ def stretches_of(joint: joints.Joint) -> tuple[Stretch, ...]:
     return whole([experiment_from_log(joints.log_of(joint), hold="zero-order", N=joint.N)])
 
 
-def wrong_law(joint: joints.Joint, *priors: Prior) -> Fit:
-    """A fit with another friction than the joint has, from the true parameters."""
-    drive = Drive(**{p: getattr(joint, p) for p in ("N", "J_m", "J_l", *MESH)}, priors=priors)
+def wrong_law(joint: joints.Joint, *priors: Prior, stated: joints.Joint | None = None) -> Fit:
+    """A fit with another friction than the joint has, from the true parameters, or those that are stated."""
+    drive = Drive(**{p: getattr(stated or joint, p) for p in ("N", "J_m", "J_l", *MESH)}, priors=priors)
     model = TwoInertiaModel(drive).with_effects(ViscousMotorFriction())
     stretches = stretches_of(joint)
     horizon = short_horizon(model, stretches)
@@ -64,8 +64,9 @@ def test_side_that_does_not_rub_supplies_the_parameters(source: str):
     assert np.all(known.correlation[:3, 3] == 0.0)
 
 
-def test_drive_without_friction_has_two_sides_of_noise():
-    assert better_side(wrong_law(SMOOTH)) is None
+def test_sides_that_contradict_each_other_supply_nothing():
+    """An inertia is stated wrong: the equations of load and motor hold with different K."""
+    assert better_side(wrong_law(SMOOTH, stated=dataclasses.replace(SMOOTH, J_l=1.3 * SMOOTH.J_l))) is None
 
 
 def test_side_whose_inertia_is_unknown_supplies_nothing():

@@ -16,10 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
+from fitting.estimation.projection import FirstStates
 from fitting.estimation.starting_values import shaft_torques, start_beside_torques, starts_of_equation
 from hdjax import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, PiecewisePolynomial, TwoInertiaModel
 from hdjax.drive import Prior
@@ -28,11 +30,26 @@ SIDES: tuple[type[OneSideModel], ...] = (MotorDrivenModel, LoadDrivenModel)
 
 
 def one_side_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
-    """The fit of the side whose equation describes the twist better; None where neither gives starting values.
+    """The fit of the side whose equation determines K better; None where neither gives starting values.
 
     Arguments as in [`fits_of_sides`][].
     """
-    return min(fits_of_sides(model, stretches), key=lambda found: found.objective, default=None)
+    return min(fits_of_sides(model, stretches), key=stiffness_error, default=None)
+
+
+def stiffness_error(found: Fit) -> float:
+    """Relative standard error of K, whatever the colour of the residual within a segment (Liang and Zeger 1986)."""
+    linear = linearise(found.at_solution, found.unknowns)
+    slopes = FirstStates.of(linear, found.problem.segments.joined).parameters_without(linear)
+    residual = np.asarray(linear.residual).reshape(*slopes.shape[:2])
+    with np.errstate(all="ignore"):
+        scores = np.einsum("srp,sr->sp", slopes, residual)
+        information = np.einsum("srp,srq->pq", slopes, slopes)
+        if not np.all(np.isfinite(information)):
+            return np.inf
+        influence = np.linalg.pinv(information, hermitian=True) @ scores.T
+    # K enters by its logarithm.
+    return float(np.linalg.norm(influence[found.free.paths.index("K")])) or np.inf
 
 
 def fits_of_sides(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> list[Fit]:

@@ -12,7 +12,7 @@ import joints
 from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
-from fitting.estimation.one_side import fit_of_side, fits_of_sides, held_at
+from fitting.estimation.one_side import fit_of_side, fits_of_sides, held_at, one_side_fit, stiffness_error
 from fitting.estimation.starting_values import start_beside_torques
 from fitting.fit_drive import fit_only
 from fitting.report.content import report_dict
@@ -165,3 +165,14 @@ def test_torques_of_a_shaft_add_to_a_logged_torque():
 @pytest.mark.parametrize("side", ["load", "motor"])
 def test_no_torque_is_added_where_an_equation_holds_alone(side):
     assert start_beside_torques(side, model_of(SMOOTH), stretches_of(SMOOTH)) is None
+
+
+@pytest.mark.parametrize("joint", [WITH_FRICTION, WITH_LOAD_FRICTION, HANGING])
+def test_side_that_determines_stiffness_better_is_chosen(joint: joints.Joint):
+    stretches = stretches_of(joint)
+    sides = fits_of_sides(model_of(joint), stretches)
+    errors = [uncertainty(one).estimates["K"].std / float(one.model.get("K")) for one in sides]
+    chosen = one_side_fit(model_of(joint), stretches)
+    assert chosen is not None
+    assert float(chosen.model.get("K")) == float(sides[int(np.argmin(errors))].model.get("K"))
+    assert stiffness_error(chosen) == pytest.approx(min(errors), rel=0.5)
