@@ -62,7 +62,11 @@ def _moved(
     before = np.concatenate([np.asarray(slopes.before_by_parameter), -gap[:, :, None]], axis=2)
     states = FirstStates.of(slopes, found.problem.segments.joined)
     flat = states.without(columns, before).reshape(change.size, -1)
-    products = flat.T @ flat
+    with np.errstate(all="ignore"):
+        products = flat.T @ flat
+    if not np.all(np.isfinite(products)):
+        # No number of steps mends a simulation that diverges.
+        return 0.0
     information, gradient = products[:-1, :-1], products[:-1, -1]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)

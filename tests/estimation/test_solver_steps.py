@@ -2,12 +2,17 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import rig
+from fitting.estimation import solver_steps
+from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, Start, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation
+from fitting.estimation.residual import Blocks, Problem, Unknowns
 from fitting.estimation.solver_steps import needed_substeps
 from fitting.uncertainty.standard_errors import uncertainty
 
@@ -36,3 +41,16 @@ def test_predicted_parameter_shift_equals_that_of_a_refit_with_finer_steps():
     # The tolerance of 10 % covers second-order terms of the shift and the end of the iteration.
     assert needed_substeps(found, tolerance=np.inf, shift=1.1 * shift) == 1
     assert needed_substeps(found, tolerance=np.inf, shift=0.9 * shift) > 1
+
+
+def test_simulation_that_diverges_needs_no_finer_steps(monkeypatch: pytest.MonkeyPatch):
+    log = rig.drive_experiment(COUNT)
+    found = fit(rig.drive_model(), [Stretch(log, 0, COUNT)], PATHS, Segmentation(COUNT, SEGMENT, substeps=1))
+
+    def diverging(problem: Problem, unknowns: Unknowns) -> Blocks:
+        slopes = np.asarray(linearise(problem, unknowns).by_parameter).copy()
+        slopes[1] = 1e200
+        return replace(linearise(problem, unknowns), by_parameter=jnp.asarray(slopes))
+
+    monkeypatch.setattr(solver_steps, "linearise", diverging)
+    assert needed_substeps(found, tolerance=np.inf, shift=0.1) == 1
