@@ -49,40 +49,64 @@ def detectability(
     states = [own[first, :4] for (own, *_), first in zip(logs, starts, strict=True)]
     least = np.inf
     for _ in range(_PASSES):
-        normal, right, left, seen = np.zeros((3, 3)), np.zeros(3), 0.0, []
-        for (_, readings, torque, brake), first, own in zip(logs, starts, states, strict=True):
-            window = first[:, None] + np.arange(length)
-            variants = _variants(base, own)
-            runs = [_segments(p, y, torque[window], brake[window], dt, substeps) for p, y, _ in variants]
-            difference = _white(readings[window] - runs[0], sigma)
-            slopes = np.stack(
-                [_white((run - runs[0]) / size, sigma) for run, (_, _, size) in zip(runs[1:], variants[1:], strict=True)],
-                axis=-1,
-            )
-            both = np.concatenate([slopes[..., :3], difference[..., None]], axis=-1)
-            both = both - slopes[..., 3:] @ (np.linalg.pinv(slopes[..., 3:]) @ both)
-            normal += np.einsum("sir,sic->rc", both[..., :3], both[..., :3])
-            right += np.einsum("sir,si->r", both[..., :3], both[..., 3])
-            left += float(np.sum(both[..., 3] ** 2))
-            seen.append((difference, slopes))
-        step = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
-        trace = left - right @ step
+        seen = [
+            _trace(base, own, log, first[:, None] + np.arange(length), sigma, dt, substeps)
+            for log, first, own in zip(logs, starts, states, strict=True)
+        ]
+        # A step too far ends in a simulation that diverges.
+        if not all(np.isfinite(part).all() for parts in seen for part in parts):
+            break
+        step, trace = _absorbed(seen)
         if not trace < _FALLS * least:
             break
         least = trace
         base, states = _moved(base, states, step, seen)
-    return float(np.sqrt(_HELD_OUT * max(min(trace, least), 0.0)) / LIMIT)
+    return float(np.sqrt(_HELD_OUT * max(least, 0.0)) / LIMIT)
+
+
+def _trace(
+    base: Mechanism,
+    states: np.ndarray,
+    log: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    window: np.ndarray,
+    sigma: tuple[float, float],
+    dt: float,
+    substeps: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What differs in each segment's readings (segments, rows), and its derivatives by base parameters and initial
+    states, (segments, rows, 7)."""
+    _, readings, torque, brake = log
+    variants = _variants(base, states)
+    with np.errstate(all="ignore"):
+        runs = [_segments(p, y, torque[window], brake[window], dt, substeps) for p, y, _ in variants]
+        moves = [(run - runs[0]) / size for run, (_, _, size) in zip(runs[1:], variants[1:], strict=True)]
+        slopes = np.stack([_white(move, sigma) for move in moves], axis=-1)
+    return _white(readings[window] - runs[0], sigma), slopes
+
+
+def _absorbed(seen: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float]:
+    """The change of the base parameters that absorbs most, and the sum of squares that is left."""
+    normal, right, left = np.zeros((3, 3)), np.zeros(3), 0.0
+    for difference, slopes in seen:
+        both = np.concatenate([slopes[..., :3], difference[..., None]], axis=-1)
+        local = np.linalg.qr(slopes[..., 3:]).Q
+        both = both - local @ (np.swapaxes(local, 1, 2) @ both)
+        normal += np.einsum("sir,sic->rc", both[..., :3], both[..., :3])
+        right += np.einsum("sir,si->r", both[..., :3], both[..., 3])
+        left += float(np.sum(both[..., 3] ** 2))
+    step = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+    return step, float(left - right @ step)
 
 
 def _moved(
     base: Mechanism, states: Sequence[np.ndarray], step: np.ndarray, seen: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[Mechanism, list[np.ndarray]]:
     """Base parameters and initial states after a step of Gauss and Newton."""
-    scales = _scales(base)
-    moved = [
-        own + (np.linalg.pinv(slopes[..., 3:]) @ (difference - slopes[..., :3] @ step)[..., None])[..., 0] * scales
-        for own, (difference, slopes) in zip(states, seen, strict=True)
-    ]
+    scales, moved = _scales(base), []
+    for own, (difference, slopes) in zip(states, seen, strict=True):
+        found = np.linalg.qr(slopes[..., 3:])
+        rest = np.swapaxes(found.Q, 1, 2) @ (difference - slopes[..., :3] @ step)[..., None]
+        moved.append(own + np.linalg.solve(found.R, rest)[..., 0] * scales)
     k1, k3, c1 = base.k1 * (1 + step[0]), base.k3 + step[1] * base.k1 / _TWIST**2, base.c1 * (1 + step[2])
     return base._replace(k1=k1, k3=k3, c1=c1), moved
 
