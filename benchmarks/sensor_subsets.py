@@ -37,6 +37,7 @@ class Kind:
         noisy: noise of the logged torque, as a share of its rms value.
         late: whether the load's encoder is read late by up to a sample interval.
         load_friction: Coulomb friction of the load at most, as a share of N times the rms torque.
+        gravity: largest torque of gravity on the load at most, likewise.
     """
 
     outputs: tuple[str, ...]
@@ -46,11 +47,17 @@ class Kind:
     noisy: float = 0.0
     late: bool = False
     load_friction: float = 0.0
+    gravity: float = 0.0
 
     @property
     def missing(self) -> list[str]:
         """Families of the effects that the base model lacks."""
-        there = {"motor_friction": self.friction, "load_friction": self.load_friction, "sensor_delay": self.late}
+        there = {
+            "motor_friction": self.friction,
+            "load_friction": self.load_friction,
+            "gravity_load": self.gravity,
+            "sensor_delay": self.late,
+        }
         return [family for family, size in there.items() if size]
 
 
@@ -73,6 +80,7 @@ KINDS = {
     "both angles, late encoder": Kind(BOTH, late=True),
     "motor angle, noisy torque": Kind(MOTOR, noisy=0.03),
     "both angles, friction of the load": Kind(BOTH, load_friction=0.8),
+    "both angles, friction, gravity": Kind(BOTH, friction=0.5, gravity=1.0),
 }
 
 
@@ -91,6 +99,7 @@ class Joint:
     rest: float
     late: float
     load_coulomb: float
+    gravity: float
     step: float
     torque: np.ndarray
 
@@ -102,7 +111,7 @@ class Joint:
             x, v = y[0] / self.N - y[1], y[2] / self.N - y[3]
             tau = self.K * x + self.B_sp * v
             rubbing = self.coulomb * np.tanh(y[2] / self.rest) + self.viscous * y[2]
-            held = self.load_coulomb * np.tanh(y[3] * self.N / self.rest)
+            held = self.load_coulomb * np.tanh(y[3] * self.N / self.rest) + self.gravity * np.sin(y[1])
             return [y[2], y[3], (T - rubbing - tau / self.N) / self.J_m, (tau - held) / self.J_l]
 
         solver = ode(rates).set_integrator("dop853", rtol=1e-9, atol=1e-12, nsteps=100_000)
@@ -136,7 +145,8 @@ def drawn(kind: Kind, random: np.random.Generator) -> Joint:
     own = N, J_m, J_l, K, 2 * damping * np.sqrt(K * reduced), float(coulomb), float(viscous / speed)
     late = kind.late * step * random.uniform(0.1, 1.0)
     held = N * rms * kind.load_friction * random.uniform(0.2, 1.0) if kind.load_friction else 0.0
-    return Joint(*own, 2e-3 * speed, late, float(held), step, torque)
+    gravity = N * rms * kind.gravity * random.uniform(0.2, 1.0) if kind.gravity else 0.0
+    return Joint(*own, 2e-3 * speed, late, float(held), float(gravity), step, torque)
 
 
 def written(folder: Path, kind: Kind, joint: Joint, random: np.random.Generator) -> None:

@@ -43,9 +43,10 @@ def with_mesh_priors(model: Model, side: Fit) -> Model:
         side: the fit of the equation.
     """
     assert isinstance(model, TwoInertiaModel)
-    known = uncertainty(side).estimates
-    spread = {path: known[path].std / (1.0 if path == "alpha" else known[path].value) for path in MESH}
-    return with_priors(model, (*model.drive.priors, *(Prior(p, known[p].value, spread[p]) for p in MESH)))
+    known, free = uncertainty(side).estimates, side.free
+    units = dict(zip(free.paths, free.logarithmic, strict=True))
+    priors = [Prior(p, known[p].value, known[p].std / (known[p].value if units[p] else 1.0)) for p in MESH]
+    return with_priors(model, (*model.drive.priors, *priors))
 
 
 def without_mesh_priors(model: Model) -> Model:
