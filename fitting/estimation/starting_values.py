@@ -86,18 +86,15 @@ def start_beside_torques(
 
     Arguments as in [`starts_of_equation`][].
     """
-    found = []
-    for width, blind in itertools.product(WIDTHS, (False, True)):
-        solved = _solved(model, stretches, width, side, blind=blind, beside=True)
-        values = None if solved is None else _values(model, solved[0], stretches, side)
-        if solved is not None and values is not None:
-            found.append((solved[1], width, blind, values, solved[0][3:]))
-    if not found:
+    # Test functions that are insensitive to a constant torque do not determine the cosine of a small angle.
+    solved = {width: _solved(model, stretches, width, side, blind=False, beside=True) for width in WIDTHS}
+    told = {width: found for width, found in solved.items() if found is not None}
+    usable = {width: _values(model, found[0], stretches, side) for width, found in told.items()}
+    width = min((w for w, values in usable.items() if values is not None), key=lambda w: told[w][1], default=None)
+    alone = None if width is None else _solved(model, stretches, width, side, blind=False)
+    if width is None or alone is None or told[width][1] >= _MUCH * alone[1]:
         return None
-    missed, width, blind, values, strengths = min(found, key=lambda each: each[0])
-    alone = _solved(model, stretches, width, side, blind=blind)
-    assert alone is not None
-    return (model.replace(values), strengths) if missed < _MUCH * alone[1] else None
+    return model.replace(usable[width] or {}), told[width][0][3:]
 
 
 def shaft_torques(angle: Float[np.ndarray, " samples"], step: float) -> Float[np.ndarray, "samples torques"]:
