@@ -42,6 +42,8 @@ class Experiment(Record):
         outputs: names of the measured outputs, see `hdjax.dynamics.OUTPUTS`.
         load_moved: time by which the load's readings are from later rows [s], see
             [`fitting.estimation.late_readings`][].
+        shaft_torques: unit torques on a shaft whose estimated strengths are part of the torques, or None, see
+            [`fitting.estimation.one_side`][].
     """
 
     name: str = eqx.field(static=True)
@@ -58,6 +60,7 @@ class Experiment(Record):
     rate_std: float = eqx.field(static=True, default=0.0)
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
     load_moved: float = eqx.field(static=True, default=0.0)
+    shaft_torques: Float[np.ndarray, "n torques"] | None = None
 
     def __len__(self) -> int:
         return self.time.size

@@ -12,19 +12,23 @@ amplified.
 from collections.abc import Sequence
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fitting.estimation.engines import linearise
+from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.experiment import Stretch
+from fitting.estimation.experiment import Experiment, Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.starting_values import shaft_torques, start_beside_torques, starts_of_equation
 from hdjax import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, PiecewisePolynomial, TwoInertiaModel
 from hdjax.drive import Prior
+
+# Change of a torque for difference quotients, over the spring's: small beside the cubic term's range.
+_CHANGE = 1e-3
 
 SIDES: tuple[type[OneSideModel], ...] = (MotorDrivenModel, LoadDrivenModel)
 
@@ -63,12 +67,33 @@ def fits_of_sides(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> list[
     fits = []
     for side in SIDES:
         beside = start_beside_torques(side.equation, model, stretches)
-        if beside is None:
-            fits.append(fit_of_side(side, model, stretches))
-        else:
-            start, strengths = beside
-            fits.append(_best_fit(side(model.drive), [start], [_driven(side, model, s, strengths) for s in stretches]))
+        fits.append(
+            fit_of_side(side, model, stretches) if beside is None else _beside_torques(side, model, stretches, *beside)
+        )
     return [found for found in fits if found is not None]
+
+
+def _beside_torques(
+    side: type[OneSideModel],
+    model: TwoInertiaModel,
+    stretches: Sequence[Stretch],
+    start: Model,
+    strengths: Float[np.ndarray, " torques"],
+) -> Fit | None:
+    """The fit of one side beside shaft torques, whose strengths are refined by a step of Gauss and Newton."""
+    first = _best_fit(side(model.drive), [start], [_driven(side, model, s, strengths) for s in stretches])
+    if first is None:
+        return None
+    linear, further = linearise(first.at_solution, first.unknowns), torque_columns(first)
+    own = FirstStates.of(linear, first.problem.segments.joined).parameters_without(linear)
+    columns = np.concatenate([own, further], axis=2).reshape(-1, own.shape[2] + strengths.size)
+    if not np.all(np.isfinite(columns)):
+        return first
+    norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    step = -np.linalg.lstsq(columns / norm, np.asarray(linear.residual).reshape(-1), rcond=1e-10)[0] / norm
+    refined = strengths + step[own.shape[2] :]
+    second = _best_fit(side(model.drive), [first.model], [_driven(side, model, s, refined) for s in stretches])
+    return first if second is None or second.objective > first.objective else second
 
 
 def fit_of_side(side: type[OneSideModel], model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
@@ -151,13 +176,48 @@ def _driven(
     known = np.ones(len(whole), dtype=bool) if whole.weight is None else whole.weight > 0
     acceleration = CubicSpline(whole.time[known], (turn if by_motor else load)[known])(whole.time, 2)
     forcing = _through(whole.torque, whole.time, acceleration)
-    torque, load_torque = (forcing, whole.load_torque) if by_motor else (whole.torque, forcing)
+    forces = {"torque": forcing} if by_motor else {"load_torque": forcing}
+    own = {"measured": whole.measured[:, 1:], "outputs": ("dynamic_error",), "motor_angle": None}
+    driven = replace(whole, **forces, **own)
     if strengths is not None:
         shaft = load if by_motor else turn * float(model.drive.N)
-        added = _through(whole.torque, whole.time, shaft_torques(shaft, whole.time_step) @ strengths)
-        torque, load_torque = (torque, _sum(load_torque, added)) if by_motor else (_sum(torque, added), load_torque)
-    own = {"measured": whole.measured[:, 1:], "outputs": ("dynamic_error",), "motor_angle": None}
-    return Stretch(replace(whole, torque=torque, load_torque=load_torque, **own), stretch.start, stretch.stop)
+        driven = _pushed(replace(driven, shaft_torques=shaft_torques(shaft, whole.time_step)), side, strengths)
+    return Stretch(driven, stretch.start, stretch.stop)
+
+
+def _pushed(driven: Experiment, side: type[OneSideModel], strengths: Float[np.ndarray, " torques"]) -> Experiment:
+    """An experiment with shaft torques of given strengths added to the torque on the side of the equation."""
+    assert driven.shaft_torques is not None
+    added = _through(driven.torque, driven.time, driven.shaft_torques @ strengths)
+    if side is MotorDrivenModel:
+        return replace(driven, load_torque=_sum(driven.load_torque, added))
+    return replace(driven, torque=_sum(driven.torque, added))
+
+
+def torque_columns(found: Fit) -> Float[np.ndarray, "segments rows torques"]:
+    """Sensitivities of a fit to the strengths of its data's shaft torques, orthogonal to the initial states; no columns
+    without such torques."""
+    torques = [s.experiment.shaft_torques for s in found.stretches]
+    side = type(found.model)
+    if any(own is None for own in torques) or not issubclass(side, OneSideModel):
+        return np.zeros((*np.asarray(found.error).shape[:1], 0, 0))
+    problem = found.at_solution
+    linear = linearise(problem, found.unknowns)
+    unit = np.std(np.concatenate([np.asarray(own) for own in torques]), axis=0)
+    largest = float(found.model.drive.stiffness) * max(float(np.std(s.experiment.measured)) for s in found.stretches)
+    sizes = _CHANGE * largest / np.maximum(unit, 1e-300)
+    rows, gaps = [], []
+    for strengths, size in zip(np.diag(sizes), sizes, strict=True):
+        pushed = [replace(s, experiment=_pushed(s.experiment, side, strengths)) for s in found.stretches]
+        forces = found.segmentation.of(pushed)
+        other = eqx.tree_at(
+            lambda p: (p.segments.torque, p.segments.load_torque), problem, (forces.torque, forces.load_torque)
+        )
+        moved, gap = residual_at(other, found.unknowns)
+        rows.append((np.asarray(moved) - np.asarray(linear.residual)) / size)
+        gaps.append((np.asarray(gap) - np.asarray(linear.gap)) / size)
+    states = FirstStates.of(linear, problem.segments.joined)
+    return states.without(np.stack(rows, axis=-1), -np.stack(gaps, axis=-1))
 
 
 def _through(like: PiecewisePolynomial, time: np.ndarray, values: np.ndarray) -> PiecewisePolynomial:

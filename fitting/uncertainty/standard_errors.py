@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.special import stdtrit
 
 from fitting.estimation.estimate import Fit
+from fitting.estimation.one_side import torque_columns
 from fitting.estimation.sample_rate import rate_columns
 from fitting.uncertainty.input_noise import torque_noise_covariance
 from fitting.uncertainty.normal_law import NORMAL_95
@@ -123,7 +124,7 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
         empty = np.zeros((0, 0))
         return Uncertainty({}, empty, empty, empty)
     regression = linearised(fit) if regression is None else regression
-    found = _beside_rates(fit, regression)
+    found = _beside_further(fit, regression)
     if torque_noise:
         found = _described(found, torque_noise_covariance(fit, regression, found.unit))
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
@@ -136,13 +137,19 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
     return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
 
 
-def _beside_rates(fit: Fit, regression: Linearised) -> Covariance:
-    """The covariance of the free vector, including uncertain sample rates."""
-    rates = rate_columns(fit)
-    if rates is None:
+def _beside_further(fit: Fit, regression: Linearised) -> Covariance:
+    """The covariance of the free vector, including uncertain sample rates and strengths of shaft torques."""
+    columns, prior = [], []
+    rates, torques = rate_columns(fit), torque_columns(fit)
+    if rates is not None:
+        columns, prior = [rates.columns], [1.0 / rates.std**2]
+    if torques.size:
+        columns, prior = [*columns, torques], [*prior, np.zeros(torques.shape[2])]
+    if not columns:
         return covariance(regression)
     own = regression.information.shape[0]
-    wide = covariance(with_further(fit, regression, rates.columns, 1.0 / rates.std**2))
+    further = np.concatenate(columns, axis=2), np.concatenate(prior)
+    wide = covariance(with_further(fit, regression, *further))
     robust, classical, unit = (matrix[:own, :own] for matrix in (wide.robust, wide.classical, wide.unit))
     return Covariance(robust, classical, unit, wide.degrees_of_freedom[:own])
 

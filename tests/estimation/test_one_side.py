@@ -5,6 +5,7 @@ The base fit fixes K at that value where the other side does not move as the tor
 
 import dataclasses
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -149,6 +150,19 @@ def test_strengths_of_shaft_torques_are_those_of_gravity(hanging):
     assert float(start.get("K")) == pytest.approx(HANGING.K, rel=0.01)
     speed = np.std(np.gradient(hanging[0].experiment.measured[:, 0], joints.STEP))
     assert max(abs(cosine), abs(coulomb), abs(viscous) * speed) < 0.02 * HANGING.gravity
+
+
+def test_standard_errors_include_the_strengths_of_shaft_torques(hanging):
+    """A pendulum that swings little is a second spring, which the stiffness could be exchanged for."""
+    side = one_side_fit(model_of(HANGING), hanging)
+    assert side is not None
+    known = tuple(
+        dataclasses.replace(s, experiment=dataclasses.replace(s.experiment, shaft_torques=None)) for s in side.stretches
+    )
+    wide, narrow = (
+        uncertainty(found).estimates["K"].std for found in (side, eqx.tree_at(lambda f: f.stretches, side, known))
+    )
+    assert 1.05 * narrow < wide < 10.0 * narrow
 
 
 def test_torques_of_a_shaft_add_to_a_logged_torque():
