@@ -11,7 +11,9 @@ from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import MESH, base_paths
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon
 from fitting.estimation.whole_log_fit import long_fit, refitted_on_all
+from fitting.loop import close_loop
 from fitting.one_side_check import better_side, source_of, with_values_of
+from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
 from fitting.validation.account import account
 from hdjax import Drive, TwoInertiaModel
@@ -71,3 +73,16 @@ def test_sides_that_contradict_each_other_supply_nothing():
 
 def test_side_whose_inertia_is_unknown_supplies_nothing():
     assert better_side(wrong_law(RUBBING["load equation"], Prior("J_l", SMOOTH.J_l, np.inf))) is None
+
+
+def test_loop_finds_gravity_behind_the_friction_of_the_motor():
+    """An inexact law of the motor's friction may leave as much, but not in the load's own equation."""
+    joint = dataclasses.replace(RUBBING["load equation"], gravity=0.02 * SMOOTH.K)
+    experiment = experiment_from_log(joints.log_of(joint, count=3000), hold="zero-order", N=joint.N)
+    model = TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=1.0))
+    report = report_dict(close_loop(model, {"zero-order": (experiment,)}, hold="zero-order"))
+    assert report["decision"] == "effect_found"
+    assert {e["family"] for e in report["after"]["effects"]} == {"motor_friction", "gravity_load"}
+    low, high = report["after"]["parameters"]["K"]["ci95"]
+    assert low < joint.K < high and high - low < 1e-3 * joint.K
+    assert report["before"]["parameters"]["K"]["prior"] is None

@@ -24,8 +24,8 @@ The simulator (`benchmarks/undeclared`) shares no code with the package; `benchm
 is registered before it begins: no rule was changed between the draw of its seed and its end. Every registered run is on
 this page, which `benchmarks/undeclared/page.py` generates.
 
-Up to seed 8215 the strengths of quick creep are far too large: what a larger K absorbs of it was computed to first order
-only. Some of it can't be told from a larger K.
+Up to seed 8215 the strengths of quick creep are far too large: what a larger K absorbs of it was computed to first
+order only. Some of it can't be told from a larger K.
 """
 
 

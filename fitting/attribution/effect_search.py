@@ -87,12 +87,16 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     """
     current, rounds, noise = base, [], measurement_noise(base.training)
     while len(rounds) < max_effects:
+        offered, lacking = catalogue, None
         if rounds:
             enough, noise = leaves_imperfection(current, base, noise)
             if enough:
-                break
+                lacking = study.lacking(current.model)
+                if lacking is None:
+                    break
+                offered = [form for form in catalogue if issubclass(form, lacking)]
         turn = replace(study, seed=study.seed + len(rounds))
-        this = look(Standing(current, base, noise), turn, catalogue=catalogue)
+        this = look(Standing(current, base, noise, excused=lacking is None), turn, catalogue=offered)
         rounds.append(this)
         if not this.accepted:
             break

@@ -97,7 +97,7 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
         gain=verdict.gain,
         p_value=verdict.p_value,
         removed=share_of_removed(trial, standing.before, standing.base),
-        imperfection=imperfection(standing.before),
+        imperfection=imperfection(standing.before) if standing.excused else 0.0,
         strength_errors=min(errors.values(), default=np.inf),
         over_noise=standing.over_noise(trial),
         at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
@@ -117,7 +117,7 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=study.seed)
     refits = _Refits(before, study)
     refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
-    found = [*refits.forms(screened), *refits.holds(screened)]
+    found = [*refits.forms(screened), *(refits.holds(screened) if standing.excused else [])]
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     found, behind = _with_ties(found)
     rivals: tuple[Rival, ...] = ()

@@ -12,8 +12,8 @@ from fitting.estimation.problem import Segmentation
 from fitting.estimation.scales import scales
 from fitting.estimation.solver_steps import needed_substeps
 from fitting.progress import Progress, silent
-from hdjax import Hold, Model
-from hdjax.effects import Scales
+from hdjax import Hold, Model, MotorDrivenModel
+from hdjax.effects import Effect, LoadSideEffect, MotorSideEffect, Scales
 
 # Least decrease of the objective, times two, over a few steps for an iteration to go on; the second one applies while
 # several candidates compete.
@@ -65,6 +65,15 @@ class Study:
     def scales(self, stretches: Sequence[Stretch], model: Model) -> Scales:
         """Orders of magnitude of a motion, see [`fitting.estimation.scales.scales`][]."""
         return replace(scales(stretches, model), load_late=self.load_late)
+
+    def lacking(self, model: Model) -> type[Effect] | None:
+        """The kind of effect that a model lacks according to the equation of `side`, if that needs torques on its own
+        side. An inexact law of friction on the other side does not enter that equation.
+        """
+        if self.side is None or self.side.stretches[0].experiment.shaft_torques is None:
+            return None
+        kind = LoadSideEffect if isinstance(self.side.model, MotorDrivenModel) else MotorSideEffect
+        return None if any(isinstance(effect, kind) for effect in model.effects) else kind
 
     def with_substeps(self, count: int) -> "Study":
         """The same with a given number of solver steps per sample interval."""

@@ -111,10 +111,11 @@ class Standing:
         before: the current model.
         base: the model without any effect.
         noise: of the measured outputs.
+        excused: whether an inexact law of its effects may explain what it leaves.
     """
 
-    def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise) -> None:
-        self.before, self.base, self.noise = before, base, noise
+    def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise, *, excused: bool = True) -> None:
+        self.before, self.base, self.noise, self.excused = before, base, noise, excused
 
     @cached_property
     def left(self) -> NoiseModel | None:
