@@ -49,10 +49,10 @@ def stiffness_error(found: Fit) -> float:
     with np.errstate(all="ignore"):
         scores = np.einsum("srp,sr->sp", slopes, residual)
         information = np.einsum("srp,srq->pq", slopes, slopes)
-        if not np.all(np.isfinite(information)):
+        if not (np.all(np.isfinite(information)) and np.all(np.isfinite(scores))):
             return np.inf
         influence = np.linalg.pinv(information, hermitian=True) @ scores.T
-    # K enters by its logarithm.
+    # K enters by its logarithm. Without any influence on the residual it is not determined.
     return float(np.linalg.norm(influence[found.free.paths.index("K")])) or np.inf
 
 
@@ -87,10 +87,11 @@ def _beside_torques(
     linear, further = linearise(first.at_solution, first.unknowns), torque_columns(first)
     own = FirstStates.of(linear, first.problem.segments.joined).parameters_without(linear)
     columns = np.concatenate([own, further], axis=2).reshape(-1, own.shape[2] + strengths.size)
-    if not np.all(np.isfinite(columns)):
+    residual = np.asarray(linear.residual).reshape(-1)
+    if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(residual))):
         return first
     norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    step = -np.linalg.lstsq(columns / norm, np.asarray(linear.residual).reshape(-1), rcond=1e-10)[0] / norm
+    step = -np.linalg.lstsq(columns / norm, residual, rcond=1e-10)[0] / norm
     refined = strengths + step[own.shape[2] :]
     second = _best_fit(side(model.drive), [first.model], [_driven(side, model, s, refined) for s in stretches])
     return first if second is None or second.objective > first.objective else second
