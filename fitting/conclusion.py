@@ -16,8 +16,9 @@ from fitting.discrepancy.challenge import Challenge
 from fitting.discrepancy.learn import Unknown, learn_supported
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
+from fitting.estimation.one_side import held_at
 from fitting.estimation.whole_log_fit import long_fit
-from fitting.one_side_check import better_side, with_values_of
+from fitting.one_side_check import better_side
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
 from fitting.uncertainty.one_side import without_mesh_priors
@@ -113,7 +114,7 @@ def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[F
     if max(seen.excess) < RULES.excess:
         return long_fit(found), None
     side = study.side or better_side(found)
-    return long_fit(found if side is None else with_values_of(side, found)), side
+    return long_fit(found if side is None else held_at(side.model, found, side.free.paths)), side
 
 
 def _final_evidence(

@@ -5,7 +5,7 @@ side's own equation does not, that equation determines K, alpha and B_sp without
 """
 
 from fitting.attribution.rules import RULES
-from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import with_priors
 from fitting.estimation.one_side import fits_of_sides, stiffness_error, with_known_priors
 from fitting.estimation.starting_values import sees_twist
@@ -32,24 +32,6 @@ def better_side(found: Fit) -> Fit | None:
         return None
     agrees = told[0].ci95[0] <= own.value <= told[0].ci95[1]
     return None if agrees and own.std <= told[0].std else sides[0]
-
-
-def with_values_of(side: Fit, found: Fit) -> Fit:
-    """A fit of the drive with its parameters fixed at those of one side's equation.
-
-    Args:
-        side: the fit of that equation.
-        found: the fit of the drive.
-    """
-    shared = tuple(path for path in side.free.paths if path in found.free.paths)
-    return fit(
-        found.model.replace({path: side.model.get(path) for path in shared}),
-        found.stretches,
-        found.free.paths,
-        found.segmentation,
-        start=Start(found.covariance, found.unknowns.states),
-        strategy=Strategy(hold_parameters=shared),
-    )
 
 
 def source_of(side: Fit | None) -> str:

@@ -9,10 +9,11 @@ import joints
 from fitting.estimation.estimate import Fit, fit
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import MESH, base_paths
+from fitting.estimation.one_side import held_at
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon
 from fitting.estimation.whole_log_fit import long_fit, refitted_on_all
 from fitting.loop import close_loop
-from fitting.one_side_check import better_side, source_of, with_values_of
+from fitting.one_side_check import better_side, source_of
 from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
 from fitting.validation.account import account
@@ -51,7 +52,7 @@ def test_side_that_does_not_rub_supplies_the_parameters(source: str):
         assert abs(estimate.value - getattr(joint, path)) < 4.0 * estimate.std, (path, estimate)
     assert abs(float(found.model.get("K")) - joint.K) > 4.0 * uncertainty(side).estimates["K"].std
 
-    fixed = with_values_of(side, found)
+    fixed = held_at(side.model, found, side.free.paths)
     long = long_fit(fixed)
     both = refitted_on_all(long, fixed)
     for each in (fixed, long, both):

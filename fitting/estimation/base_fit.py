@@ -25,6 +25,7 @@ from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.scales import largest_torque
 from fitting.estimation.starting_values import (
+    MOST_LEFT,
     apart,
     sees_twist,
     starting_models,
@@ -40,10 +41,9 @@ from hdjax.drive import Prior
 _TRIAL_STEPS = 10
 # A start whose trial is this much worse than the best (in the objective: 10 % of the error) is dropped.
 _HOPELESS = 0.1
-# First: distance of a fit's log stiffness from all weak forms that are insensitive to constant loads. Beyond it, an
-# unlogged load may have caused a wrong minimum. It has, where constant loads per segment leave less than the second
-# number, a share of the error.
-_OFF, _MUCH = 0.3, 0.5
+# Distance of a fit's log stiffness from all weak forms that are insensitive to constant loads. Beyond it, an unlogged
+# load may have caused a wrong minimum. It has, where constant loads per segment explain most of the error.
+_OFF = 0.3
 # Passes of outlier removal; each improves the noise estimate, and so detects smaller outliers.
 _CLEANINGS = 3
 # Lags of the whiteness test, and its significance level.
@@ -82,7 +82,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Bas
         best, start, source = _fit_of_twist(model, training, halo)
     else:
         alone, beside, start = fits_of_starts(starting_models(model, training), training, halo)
-        much = alone.objective - beside.objective > -np.log(_MUCH)
+        much = alone.objective - beside.objective > -np.log(MOST_LEFT)
         best = held_beside(beside, start, training, halo) if much else alone
         source = refitted_beside(best) if much else None
     if is_held(best):
@@ -194,7 +194,7 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     loaded = fitted(starts[0].with_effects(SteadyLoad(reach=reach)))
     bare = loaded.model.without_effect(SteadyLoad.name)
     other = fitted(bare)
-    if not loaded.objective < other.objective + np.log(_MUCH):
+    if not loaded.objective < other.objective + np.log(MOST_LEFT):
         return best
     return other if apart(other.model, bare) < _OFF else fitted(bare, strategy=Strategy(hold_parameters=True))
 
@@ -218,7 +218,7 @@ def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
     """
     if driven is None:
         return False
-    return held_at(best.model, driven).objective - driven.objective > -np.log(_MUCH)
+    return held_at(best.model, driven).objective - driven.objective > -np.log(MOST_LEFT)
 
 
 def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:

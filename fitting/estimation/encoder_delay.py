@@ -15,15 +15,13 @@ import numpy as np
 
 from fitting.estimation import weak_form
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.starting_values import sees_twist
+from fitting.estimation.starting_values import MOST_LEFT, sees_twist
 from fitting.estimation.weak_form import WIDTHS, blind_functions
 from hdjax import Model, TwoInertiaModel
 
 LONGEST_DELAY = 1e-2
 """Longest delay that is looked for [s]; assumed, several cycles of a bus."""
 
-# A delay must leave less than this share of the rms error without one, assumed: as for other causes of a wrong minimum.
-_LEFT = 0.5
 # Most rows of a delay, and of a stretch, that are looked at: more take longer and tell little.
 _MOST_ROWS, _ENOUGH = 64, 4000
 # Rows between the delays of the first search: the error changes smoothly over a part of a period.
@@ -51,12 +49,12 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     near, width = min(itertools.product(coarse, WIDTHS), key=lambda pair: left(*pair))
     close = range(max(near - _APART, -most), min(near + _APART, most) + 1)
     row = min(close, key=lambda row: left(row, width))
-    if not left(row, width) < _LEFT**2 * left(0, width):
+    if not left(row, width) < MOST_LEFT**2 * left(0, width):
         return 0.0
     # Friction of the load with a memory shifts its phase as well, over wide test functions alone, and the motor's
     # equation does not contain it. The likelihood depends on the product of all errors, where each has its own noise.
     falls = [left(row, *how) / max(left(0, *how), 1e-300) for how in itertools.product(WIDTHS, ("load", "motor"))]
-    return row * step if np.prod(falls) < _LEFT**2 else 0.0
+    return row * step if np.prod(falls) < MOST_LEFT**2 else 0.0
 
 
 def _signals(stretch: Stretch) -> tuple[np.ndarray, ...]:

@@ -43,9 +43,7 @@ def one_side_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | 
 
 def stiffness_error(found: Fit) -> float:
     """Relative standard error of K, whatever the colour of the residual within a segment (Liang and Zeger 1986)."""
-    linear = linearise(found.at_solution, found.unknowns)
-    slopes = FirstStates.of(linear, found.problem.segments.joined).parameters_without(linear)
-    residual = np.asarray(linear.residual).reshape(*slopes.shape[:2])
+    slopes, residual = _regression(found)
     with np.errstate(all="ignore"):
         scores = np.einsum("srp,sr->sp", slopes, residual)
         information = np.einsum("srp,srq->pq", slopes, slopes)
@@ -54,6 +52,14 @@ def stiffness_error(found: Fit) -> float:
         influence = np.linalg.pinv(information, hermitian=True) @ scores.T
     # K enters by its logarithm. Without any influence on the residual it is not determined.
     return float(np.linalg.norm(influence[found.free.paths.index("K")])) or np.inf
+
+
+def _regression(found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Sensitivities to the free parameters (segments, rows, parameters), orthogonal to the initial states, and the
+    residual (segments, rows)."""
+    linear = linearise(found.at_solution, found.unknowns)
+    slopes = FirstStates.of(linear, found.problem.segments.joined).parameters_without(linear)
+    return slopes, np.asarray(linear.residual).reshape(*slopes.shape[:2])
 
 
 def fits_of_sides(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> list[Fit]:
@@ -84,14 +90,12 @@ def _beside_torques(
     first = _best_fit(side(model.drive), [start], [_driven(side, model, s, strengths) for s in stretches])
     if first is None:
         return None
-    linear, further = linearise(first.at_solution, first.unknowns), torque_columns(first)
-    own = FirstStates.of(linear, first.problem.segments.joined).parameters_without(linear)
-    columns = np.concatenate([own, further], axis=2).reshape(-1, own.shape[2] + strengths.size)
-    residual = np.asarray(linear.residual).reshape(-1)
+    own, residual = _regression(first)
+    columns = np.concatenate([own, torque_columns(first)], axis=2).reshape(residual.size, -1)
     if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(residual))):
         return first
     norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    step = -np.linalg.lstsq(columns / norm, residual, rcond=1e-10)[0] / norm
+    step = -np.linalg.lstsq(columns / norm, residual.reshape(-1), rcond=1e-10)[0] / norm
     refined = strengths + step[own.shape[2] :]
     second = _best_fit(side(model.drive), [first.model], [_driven(side, model, s, refined) for s in stretches])
     return first if second is None or second.objective > first.objective else second
@@ -138,20 +142,22 @@ def with_known_priors(found: Fit, priors: Sequence[Prior]) -> Fit:
     return fit(model, found.stretches, base_paths(model), found.segmentation, start=start)
 
 
-def held_at(model: Model, found: Fit) -> Fit:
-    """A fit of one side with K, alpha and B_sp fixed at those of another model.
+def held_at(model: Model, found: Fit, paths: Sequence[str] | None = None) -> Fit:
+    """A fit with some or all parameters fixed at those of another model.
 
     Args:
         model: supplies the values.
-        found: the fit of one side.
+        found: the fit.
+        paths: dotted paths of the values; those that the fit does not free don't count. All of the fit's if None.
     """
+    fixed = tuple(path for path in found.free.paths if paths is None or path in paths)
     return fit(
-        found.model.replace({path: model.get(path) for path in found.free.paths}),
+        found.model.replace({path: model.get(path) for path in fixed}),
         found.stretches,
         found.free.paths,
         found.segmentation,
         start=Start(found.covariance, found.unknowns.states),
-        strategy=Strategy(hold_parameters=True),
+        strategy=Strategy(hold_parameters=fixed),
     )
 
 

@@ -24,9 +24,9 @@ from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 
 # Starts whose log stiffness differs by less than this end in the same minimum.
 _DISTINCT = 0.1
-# Torques on a shaft explain most of an equation's error where they leave less than this share, assumed: as for other
-# causes of a wrong minimum.
-_MUCH = 0.5
+
+MOST_LEFT = 0.5
+"""Largest share of an rms error that is left where a cause of a wrong minimum explains most of it; assumed."""
 
 
 def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
@@ -92,7 +92,7 @@ def start_beside_torques(
     usable = {width: _values(model, found[0], stretches, side) for width, found in told.items()}
     width = min((w for w, values in usable.items() if values is not None), key=lambda w: told[w][1], default=None)
     alone = None if width is None else _solved(model, stretches, width, side, blind=False)
-    if width is None or alone is None or told[width][1] >= _MUCH * alone[1]:
+    if width is None or alone is None or told[width][1] >= MOST_LEFT * alone[1]:
         return None
     return model.replace(usable[width] or {}), told[width][0][3:]
 

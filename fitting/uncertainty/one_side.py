@@ -43,9 +43,9 @@ def with_mesh_priors(model: Model, side: Fit) -> Model:
         side: the fit of the equation.
     """
     assert isinstance(model, TwoInertiaModel)
-    known, free = uncertainty(side).estimates, side.free
-    units = dict(zip(free.paths, free.logarithmic, strict=True))
-    priors = [Prior(p, known[p].value, known[p].std / (known[p].value if units[p] else 1.0)) for p in MESH]
+    known = uncertainty(side).estimates
+    logarithmic = dict(zip(side.free.paths, side.free.logarithmic, strict=True))
+    priors = [Prior(p, known[p].value, known[p].std / (known[p].value if logarithmic[p] else 1.0)) for p in MESH]
     return with_priors(model, (*model.drive.priors, *priors))
 
 
