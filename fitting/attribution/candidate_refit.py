@@ -10,8 +10,9 @@ from fitting.attribution.rules import RULES
 from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, Strategy
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax import Hold, Model
-from hdjax.effects import Effect
+from hdjax.effects import Effect, Scales
 from hdjax.parameters import as_scalar, own_parameters
 
 # Iterations after which another hold of the torque must explain more: it changes the motion so little that few suffice.
@@ -75,7 +76,27 @@ def _as_sibling(effect: Effect, before: Trial, sibling: Trial) -> Model | None:
 def complete_refit(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_above: float) -> Trial | None:
     """The completed refit after its first pass, or None where it is given up; arguments as in [`try_lead`][]."""
     trial = completed(begun, study, before.hold, champion=before, give_up_above=give_up_above)
-    return None if trial is None else replace(trial, lasting=lasting_share(lead.effect, before, trial))
+    if trial is None:
+        return None
+    starts = _away_from_bounds(trial.model, lead.effect, study.scales(before.training.stretches, before.model))
+    if starts:
+        near = [trial.training] * len(starts)
+        again = first_pass(starts, study, before.hold, near=near, champion=before)
+        trial = completed(again, study, before.hold, champion=trial) or trial
+    return replace(trial, lasting=lasting_share(lead.effect, before, trial))
+
+
+def _away_from_bounds(model: Model, effect: Effect, scales: Scales) -> list[Model]:
+    """The model with the effect's parameters that ended at a bound at the values of its proposals, the others as they
+    are; none where it ended at no bound. A shape that grows without limit ends in a simpler law, far from the optimum.
+    """
+    names = [path.removeprefix(f"{effect.name}.") for path in parameters_at_bounds(model, effect.name)]
+    found = {}
+    for proposal in type(effect).proposals(scales) if names else ():
+        values = {f"{effect.name}.{name}": float(getattr(proposal, name)) for name in names}
+        if all(values.values()):
+            found[tuple(values.values())] = model.replace(values)
+    return list(found.values())
 
 
 def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
