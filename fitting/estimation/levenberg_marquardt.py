@@ -22,18 +22,20 @@ from fitting.estimation.residual import Blocks, Products, Unknowns, moved_gap
 from fitting.record import Record
 from hdjax.compilation import library_of, on_host
 
-# Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
-# keeps more is followed by a bolder one. Damping that is small on the diagonal may be large across it, so it must go
-# quickly where the model predicts well.
-_KEPT, _WELL = 0.01, 0.75
-_LONGER, _SHORTER = 30.0, 0.1
-# Relative changes of the sum of squares that are none; share of the gaps that a step leaves which closes them, and of
-# the residual that it may leave.
-_SLIGHT, _CLOSED, _DEAREST = 1e-4, 0.25, 1.5
-# With less damping than this, relative to the diagonal, rounding decides whether the normal equations are definite.
-_LEAST_DAMPING = 1e-12
-# Points between which an iteration must make progress.
-_LATEST = 6
+KEPT, WELL = 0.01, 0.75
+"""Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
+keeps more is followed by a bolder one."""
+LONGER, SHORTER = 30.0, 0.1
+"""Factors of a step's size then. Damping that is small on the diagonal may be large across it, so it must go quickly
+where the model predicts well."""
+SLIGHT = 1e-4
+"""Relative change of the sum of squares that is none."""
+LEAST_DAMPING = 1e-12
+"""With less damping than this, relative to the diagonal, rounding decides whether the normal equations are definite."""
+LATEST = 6
+"""Points between which an iteration must make progress."""
+# Share of the gaps that a step leaves which closes them, and of the residual that it may leave.
+_CLOSED, _DEAREST = 0.25, 1.5
 
 
 class Chains(eqx.Module):
@@ -133,7 +135,7 @@ class ArrowSystem(Record):
         share = library.stack([library.ones_like(closing), closing])
         own = self.own + damping * _diagonal(self.own)
         right = library.concatenate([self.coupling, (self.own_gradient @ share)[:, :, None]], axis=2)
-        solved = _solve_scaled(own, right)
+        solved = solve_scaled(own, right)
         response, own_step = solved[:, :, :-1], solved[:, :, -1]
         shared = self.shared + damping * library.diag(library.where(self.yardstick > 0, self.yardstick, 1.0))
         rows = own_step.size, shared.shape[0]
@@ -152,12 +154,12 @@ class ArrowSystem(Record):
         library = library_of(self.own, damping)
         closing = 1.0 / (1.0 + damping)
         matrix, gradient, response, own_step = self.eliminate(damping, closing)
-        wanted = -_solve_scaled(matrix, gradient[:, None])[:, 0]
+        wanted = -solve_scaled(matrix, gradient[:, None])[:, 0]
         held = library.abs(wanted) > longest
         ends = library.where(held, library.sign(wanted) * longest, 0.0)
         left = library.where(held, 0.0, gradient + matrix @ ends)
         others = library.where(held[:, None] | held[None, :], 0.0, matrix)
-        shared = ends - _solve_scaled(others, left[:, None])[:, 0]
+        shared = ends - solve_scaled(others, left[:, None])[:, 0]
         first = -own_step - response @ shared
         path = self.chains
         states = path.by_parameter @ shared + closing * path.closing
@@ -218,7 +220,7 @@ def _diagonal(matrix: Any) -> Any:
     return library.where(d > 0, d, 1.0)[..., None] * np.broadcast_to(np.eye(d.shape[-1]), matrix.shape)
 
 
-def _solve_scaled(matrix: Any, right: Any) -> Any:
+def solve_scaled(matrix: Any, right: Any) -> Any:
     """Solve symmetric positive systems after scaling their diagonals to one; a direction without information does not
     move. Without a solution to working precision, no numbers."""
     library = library_of(matrix, right)
@@ -318,7 +320,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return Iteration(
             ahead=y,
             found=jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), aux_struct),
-            costs=np.full(_LATEST, np.inf),
+            costs=np.full(LATEST, np.inf),
             rows=zero,
             gap=zero,
             promised=np.array(-np.inf),
@@ -335,12 +337,12 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         where = library.where
         rows, gap = seen.square, library.sum((seen.gap * self.gap_weight[None]) ** 2)
         cost, before, first = 0.5 * (rows + gap), state.costs[0], state.count == 0
-        kept = first | (cost - before <= _KEPT * state.promised)
-        well = ~first & (cost - before < _WELL * state.promised)
-        slight = library.abs(cost - before) < _SLIGHT * before
+        kept = first | (cost - before <= KEPT * state.promised)
+        well = ~first & (cost - before < WELL * state.promised)
+        slight = library.abs(cost - before) < SLIGHT * before
         closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * library.maximum(state.rows, state.expected))
         accepted = kept | slight | closing
-        size = state.size * where(kept, where(well, _LONGER, 1.0), where(accepted, 1.0, _SHORTER))
+        size = state.size * where(kept, where(well, LONGER, 1.0), where(accepted, 1.0, SHORTER))
         costs = library.concatenate([cost[None], state.costs[:-1]])
         new, old = (state.ahead, seen, costs, rows, gap), (y, state.found, state.costs, state.rows, state.gap)
         best, found, costs, rows, gap = jax.tree.map(lambda a, b: where(accepted, a, b), new, old)
@@ -348,7 +350,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
         # most that it has ever shown (Moré 1978).
         system = normal_equations(found, self.joined, state.yardstick)
-        step = system.step(library.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
+        step = system.step(library.maximum(self.damping / size, LEAST_DAMPING), self.longest)
         promised, expected = self._promised(found, step)
         # Where the system has no solution to working precision, another step from here is more damped.
         solved = library.isfinite(promised)
@@ -360,7 +362,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gap=gap,
             promised=where(solved, promised, -jnp.inf),
             expected=where(solved, expected, 0.0),
-            size=where(solved, size, _SHORTER * size),
+            size=where(solved, size, SHORTER * size),
             yardstick=system.yardstick,
             count=state.count + 1,
             accepted=accepted,

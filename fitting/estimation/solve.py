@@ -15,6 +15,7 @@ from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.machine_code import task
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
+from fitting.estimation.separate_states import solve_states
 from hdjax.compilation import jit_small, on_host
 from hdjax.lanes import on_one_device, placed_like
 
@@ -70,6 +71,8 @@ def solve(
         least_progress: share of the sum of squares that a few steps must take off it for the iteration to go on.
     """
     segments = problem.segments
+    if not (np.asarray(problem.active).any() or np.asarray(segments.joined).any()):
+        return _states_alone(problem, start, max_steps, damping, least_progress)
     solver = ArrowLevenbergMarquardt(
         joined=np.asarray(segments.joined),
         gap_weight=np.asarray(problem.gap_weight),
@@ -95,6 +98,18 @@ def solve(
             seen, rows = look(state.ahead)
     unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
     return Solution(unknowns, _left_over(problem, found), bool(done and finite), int(state.count))
+
+
+def _states_alone(problem: Problem, start: Unknowns, max_steps: int, damping: float, least_progress: float) -> Solution:
+    """Least squares of initial states with fixed parameters."""
+    look, begin = _sight_of(problem, start), on_host(start)
+    rtol = ArrowLevenbergMarquardt.rtol
+    with np.errstate(all="ignore"):
+        best, found, done, steps = solve_states(
+            look, begin, max_steps, damping, rtol=rtol, least_progress=least_progress
+        )
+    unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
+    return Solution(unknowns, _left_over(problem, found), done, steps)
 
 
 def _sight_of(problem: Problem, start: Unknowns) -> Callable[[Unknowns], tuple[Products, Array | np.ndarray]]:

@@ -70,7 +70,7 @@ def test_step_equals_that_of_dense_least_squares(damping: float):
     right = np.concatenate([-r, np.zeros(length.size)])
     expected = np.linalg.lstsq(rows, right, rcond=None)[0] / length
     step = flat(take_step(found, jnp.asarray(damping)))
-    # Normal equations square the condition of the scaled columns (about 10), and _solve_scaled adds 1e-13.
+    # Normal equations square the condition of the scaled columns (about 10), and solve_scaled adds 1e-13.
     np.testing.assert_allclose(step * length, expected * length, atol=1e-10)
     assert np.max(np.abs(step * length)) > (1e-3 if damping < 10 else 1e-5)
 
