@@ -130,7 +130,7 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
         seen: the evidence so far.
         rules: the thresholds.
     """
-    if seen.enough:
+    if seen.enough and (seen.names or "beside" in seen.asked):
         return None
     little = _leaves_little(seen, rules)
     if seen.names and not little and "instead" not in seen.asked:

@@ -79,6 +79,8 @@ class Unknown(eqx.Module):
 def learn(before: Trial, study: Study) -> Unknown | None:
     """Learn a term that a model lacks.
 
+    Where its residual appears white, little can be missing: a function of one variable is all that the data may show.
+
     Args:
         before: the current model.
         study: the data and their segmentation.
@@ -89,13 +91,14 @@ def learn(before: Trial, study: Study) -> Unknown | None:
     study.progress("screening variables of a learned term")
     seen = search_context(before.training)
     least = _LEAST_SHARE_BESIDE if before.model.effects else _LEAST_SHARE
-    found = sorted((c for c in candidates(seen) if c.gain > least), key=lambda c: -c.gain)
+    faint = leaves_white_noise(before.training)
+    found = sorted((c for c in candidates(seen, pairs=not faint) if c.gain > least), key=lambda c: -c.gain)
     alone, pairs = ([c for c in found if (len(c.variables) > 1) == several] for several in (False, True))
 
     best = _likeliest(alone, None, before, study)
     memory: MemoryScreen | None = None
     remembered: tuple[MemoryCandidate, Trial] | None = None
-    if not _is_enough(best):
+    if not (faint or _is_enough(best)):
         memory = screen_memory(before, seen, study, least=least)
         # A law with memory has fewer parameters than a function of two variables.
         if memory.candidates and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0):

@@ -136,9 +136,9 @@ def search_context(fit: Fit) -> SearchContext:
     return SearchContext(look, values, weight, spectral_lines(fit))
 
 
-def candidates(seen: SearchContext) -> list[Candidate]:
-    """Candidates of every place with every variable, and with pairs: the best variable with another, or any two where
-    no single one has a gain."""
+def candidates(seen: SearchContext, *, pairs: bool) -> list[Candidate]:
+    """Candidates of every place with every variable; and with two where asked for: the best variable with another, or
+    any two where no single one has a gain."""
     reduced = isinstance(seen.look.model, ReducedModel)
     forms = [form for form in LEARNED if not (form.needs_motor and reduced)]
     own = {form: own_functions(seen, form) for form in forms}
@@ -150,12 +150,14 @@ def candidates(seen: SearchContext) -> list[Candidate]:
 
     alone = {form: look_at(form, [(name,) for name in may[form]]) for form in forms}
     found = [candidate for those in alone.values() for candidate in those]
+    if not pairs:
+        return found
     any_two = all(candidate.gain < RULES.coefficient for candidate in found)
     for form, those in alone.items():
         best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
-        pairs = (p for p in combinations(may[form], 2) if any_two or best & set(p))
+        both = (p for p in combinations(may[form], 2) if any_two or best & set(p))
         # The angles of both shafts are equal except for the twist.
-        found += look_at(form, (p for p in pairs if not set(p) <= set(ANGLES)))
+        found += look_at(form, (p for p in both if not set(p) <= set(ANGLES)))
     return found
 
 
