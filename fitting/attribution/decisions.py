@@ -51,8 +51,10 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
         seen: the evidence for it.
         rules: the thresholds.
     """
-    least, errors, chance = rules.least_gain, rules.strength_errors, rules.significance
+    errors, chance = rules.strength_errors, rules.significance
     nats, over = rules.noise_gain, seen.over_noise
+    # Selection data may hardly excite the effect (the end of a chirp). Against a noise model training data count.
+    least = rules.least_gain if np.isinf(over) else 0.0
     return (
         Check("least_gain", seen.name, seen.gain, least, seen.gain > least),
         Check("significance", seen.name, seen.p_value, chance, seen.p_value <= chance),
