@@ -37,6 +37,8 @@ CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, ()),), CHA
     [
         ({}, None),
         ({"gain": 1e-4}, "least_gain"),
+        # Noise explains the residual: the likelihood against it decides.
+        ({"gain": 1e-4, "over_noise": 20.0}, None),
         ({"p_value": 0.02}, "significance"),
         ({"removed": 0.01, "imperfection": 0.02}, "imperfection"),
         ({"strength_errors": 3.0}, "strength_errors"),

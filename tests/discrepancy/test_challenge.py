@@ -93,7 +93,7 @@ def test_names_stand_if_the_learned_term_is_worse_in_free_runs(longer_worse: flo
         (2, False, True, []),
         (3, False, False, ["instead", "beside"]),
         (0, False, False, ["beside"]),
-        (0, True, False, []),
+        (0, True, False, ["beside"]),
     ],
 )
 def test_learned_terms_to_fit_depend_on_names_and_noise(names: int, white: bool, imperfect: bool, asks_for: list[str]):
