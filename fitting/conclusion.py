@@ -113,7 +113,7 @@ def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[F
     found = eqx.tree_at(lambda f: f.model, found, without_mesh_priors(found.model))
     if max(seen.excess) < RULES.excess:
         return long_fit(found), None
-    side = study.side or better_side(found)
+    side = study.side_of(found.model) or better_side(found)
     return long_fit(found if side is None else held_at(side.model, found, side.free.paths)), side
 
 

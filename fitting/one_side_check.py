@@ -15,14 +15,17 @@ from hdjax import OneSideModel, TwoInertiaModel
 
 
 def better_side(found: Fit) -> Fit | None:
-    """The fit of one side whose own equation leaves only noise, if that excludes the model's K or determines it better;
-    None also where both sides leave only noise and contradict each other, since an inertia is then wrong.
+    """The fit of one side whose own equation leaves only noise, if that excludes the model's K or determines it better.
+    None also where an inertia is wrong: an effect corrects it, or both sides leave only noise and contradict each
+    other.
 
     Args:
         found: the fit of a model that leaves more than noise.
     """
     model = found.model
     if not isinstance(model, TwoInertiaModel) or not sees_twist(found.stretches):
+        return None
+    if any(effect.corrects for effect in model.effects):
         return None
     fits = fits_of_sides(with_priors(TwoInertiaModel(model.drive), ()), found.stretches)
     good = [one for one in fits if leaves_only_noise(one, found, most=RULES.excess)]

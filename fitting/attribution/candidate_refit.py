@@ -11,6 +11,7 @@ from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, Strategy
 from fitting.uncertainty.identifiability import parameters_at_bounds
+from fitting.uncertainty.one_side import contradicts, without_mesh_priors
 from hdjax import Hold, Model
 from hdjax.effects import Effect, Scales
 from hdjax.parameters import as_scalar, own_parameters
@@ -42,6 +43,8 @@ def begin(before: Trial, lead: Lead, study: Study, *, sibling: Trial | None = No
         sibling: a refit with another form of its family, whose values are one more start.
     """
     model = before.model
+    if contradicts(lead.effect, study.side):
+        model = without_mesh_priors(model)
     known = model.parameters()
     moved = {}
     for path, change in lead.drive_changes.items():

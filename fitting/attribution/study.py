@@ -12,6 +12,7 @@ from fitting.estimation.problem import Segmentation
 from fitting.estimation.scales import scales
 from fitting.estimation.solver_steps import needed_substeps
 from fitting.progress import Progress, silent
+from fitting.uncertainty.one_side import contradicts
 from hdjax import Hold, Model, MotorDrivenModel
 from hdjax.effects import Effect, LoadSideEffect, MotorSideEffect, Scales
 
@@ -66,13 +67,19 @@ class Study:
         """Orders of magnitude of a motion, see [`fitting.estimation.scales.scales`][]."""
         return replace(scales(stretches, model), load_late=self.load_late)
 
+    def side_of(self, model: Model) -> Fit | None:
+        """The side whose equation determines a model's K, alpha and B_sp; None without any, or where an effect corrects
+        a stated value that these are in proportion to."""
+        return None if any(contradicts(effect, self.side) for effect in model.effects) else self.side
+
     def lacking(self, model: Model) -> type[Effect] | None:
         """The kind of effect that a model lacks according to the equation of `side`, if that needs torques on its own
         side. An inexact law of friction on the other side does not enter that equation.
         """
-        if self.side is None or self.side.stretches[0].experiment.shaft_torques is None:
+        side = self.side_of(model)
+        if side is None or side.stretches[0].experiment.shaft_torques is None:
             return None
-        kind = LoadSideEffect if isinstance(self.side.model, MotorDrivenModel) else MotorSideEffect
+        kind = LoadSideEffect if isinstance(side.model, MotorDrivenModel) else MotorSideEffect
         return None if any(isinstance(effect, kind) for effect in model.effects) else kind
 
     def with_substeps(self, count: int) -> "Study":

@@ -9,6 +9,7 @@ from fitting.report.separating import plain_family
 from fitting.report.steps import beyond_prediction
 from fitting.uncertainty.identifiability import Identifiability
 from fitting.uncertainty.standard_errors import Estimate
+from hdjax.effects import BY_NAME
 from hdjax.parameters import ParameterInfo
 
 # Correlation above which the data determine a combination of two parameters.
@@ -80,7 +81,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     notes = list(dict.fromkeys(n for n in told if n)) + _unseen(report)
     notes += [h["sentence"] for h in found["held"]]
     notes += [_of_prior(path, e) for path, e in final["parameters"].items() if (e.get("prior") or {}).get("tolerance")]
-    notes += _of_one_side(report)
+    notes += _of_one_side(report) + _of_scale(report)
     for other in report["alternatives"]:
         if not other["separable"]:
             notes.append(
@@ -99,6 +100,18 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _of_scale(report: Mapping[str, Any]) -> list[str]:
+    """A note where two of three stated values are corrected: the third one fixes the scale of all."""
+    corrected = [e["name"] for e in report["after"]["effects"] if getattr(BY_NAME.get(e["name"]), "corrects", None)]
+    if len(corrected) < 2:
+        return []
+    return [
+        "The logs determine J_m, J_l and the scale of the torque only relative to each other. Two of the three are "
+        f"corrected ({formatting.words(corrected)}), and any other two would do as well: K and B_sp are in proportion "
+        "to the one that is taken as stated."
+    ]
 
 
 def _unseen(report: Mapping[str, Any]) -> list[str]:

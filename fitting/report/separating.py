@@ -62,6 +62,13 @@ _SEPARATING = {
     ("temperature", "creep"): "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays "
     "away.",
     ("temperature", "hysteresis"): "Cool down and repeat: thermal drift is reversible.",
+    (
+        "inertia_error",
+        "torque_sensor",
+    ): "Hold a known torque at rest: a wrong scale of the sensor shows, an inertia does not.",
+    ("inertia_error", "inertia_error"): "Add a known inertia to the load and record again.",
+    ("inertia_error", "extra_resonance"): "Excite well below the natural frequency: a wrong inertia still shows, a "
+    "resonance does not.",
     ("torque_sensor", "torque_sensor"): "Rest without load, then apply a known torque: the first shows a bias, the "
     "second a gain error.",
     ("input_delay", "nonlinear_damping"): "Excite up to several times the natural frequency: the phase of a delay "
@@ -141,6 +148,7 @@ _REVEALING = {
     "load_disturbance": "repeat at another motor speed and without excitation",
     "extra_resonance": "change the load's inertia",
     "temperature": "cool down and repeat",
+    "inertia_error": "add a known inertia and record again",
     "torque_sensor": "reverse the direction, and check the sensor with a known torque",
     "input_delay": "excite up to several times the natural frequency",
     "encoder_eccentricity": "pass slowly through the natural frequency",

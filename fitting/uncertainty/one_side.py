@@ -11,6 +11,7 @@ from fitting.uncertainty.measurement_noise import measurement_noise
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Model, OneSideModel, TwoInertiaModel
 from hdjax.drive import Prior
+from hdjax.effects import Effect
 
 
 def leaves_only_noise(side: Fit, found: Fit, *, most: float) -> bool:
@@ -30,6 +31,11 @@ def leaves_only_noise(side: Fit, found: Fit, *, most: float) -> bool:
     # Encoder noise enters the equation of one side in another way than a model of the drive, and may cancel.
     noises = (measurement_noise(fit).covariance[-1, -1] for fit in (side, found))
     return any(side.principal_std < most * float(np.sqrt(variance)) for variance in noises)
+
+
+def contradicts(effect: Effect, side: Fit | None) -> bool:
+    """Whether an effect corrects a stated value that K and B_sp of one side's equation are in proportion to."""
+    return side is not None and isinstance(side.model, OneSideModel) and effect.corrects in side.model.scaled_by
 
 
 def with_mesh_priors(model: Model, side: Fit) -> Model:

@@ -32,6 +32,7 @@ from hdjax.effects.friction import (
     ViscousMotorFriction,
 )
 from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
+from hdjax.effects.inertia import LoadInertiaError, MotorInertiaError
 from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
 from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
@@ -80,6 +81,7 @@ __all__ = [
     "LoadEncoderDelay",
     "LoadEncoderEccentricity",
     "LoadFriction",
+    "LoadInertiaError",
     "LoadSideEffect",
     "LuGreLoadFriction",
     "LuGreMotorFriction",
@@ -90,6 +92,7 @@ __all__ = [
     "MotorEncoderDelay",
     "MotorEncoderEccentricity",
     "MotorFriction",
+    "MotorInertiaError",
     "MotorSideEffect",
     "PositionDependentMeshFriction",
     "PositionDependentMotorFriction",

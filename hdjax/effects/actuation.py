@@ -41,6 +41,7 @@ class TorqueGain(ActuatorEffect):
     takes_numpy: ClassVar[bool] = True
     needs_motor: ClassVar[bool] = True
     one_shape_of: ClassVar[str | None] = "T_m"
+    corrects: ClassVar[str | None] = "k_T"
 
     gain_error: Scalar = parameter(
         0.0,

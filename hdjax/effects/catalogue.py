@@ -19,6 +19,7 @@ from hdjax.effects.friction import (
     ViscousMotorFriction,
 )
 from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
+from hdjax.effects.inertia import LoadInertiaError, MotorInertiaError
 from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
 from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
@@ -63,6 +64,8 @@ CATALOGUE: tuple[type[Effect], ...] = (
     KinematicSidebands,
     TorqueBias,
     TorqueGain,
+    MotorInertiaError,
+    LoadInertiaError,
     InputDelay,
     InputLag,
     MotorEncoderDelay,

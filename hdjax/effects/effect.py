@@ -123,6 +123,7 @@ class Effect(eqx.Module):
         drawn_against: the quantity, a field of [`Motion`][], that it is plotted over; None where no single one is
             suitable.
         one_shape_of: the quantity that it is a specific function of; another function would be another effect.
+        corrects: the parameter of the drive whose stated value it corrects.
         contains: names of the forms that it contains, with the same symbols: it replaces them.
         imperfection: possible rms error of its law, as a share of the error that it removes: no form is exact.
     """
@@ -134,6 +135,7 @@ class Effect(eqx.Module):
     named_for: ClassVar[tuple[str, ...]] = ()
     drawn_against: ClassVar[str | None] = None
     one_shape_of: ClassVar[str | None] = None
+    corrects: ClassVar[str | None] = None
     contains: ClassVar[tuple[str, ...]] = ()
     imperfection: ClassVar[float] = 3e-3
 

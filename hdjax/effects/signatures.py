@@ -11,6 +11,7 @@ SIGNATURES: dict[str, str] = {
     "kinematic_error": "Lines at fixed orders of the motor's revolution, with one phase in both directions. The force "
     "grows with the speed squared, and the natural frequency amplifies it.",
     "torque_sensor": "The residual follows the torque itself, or is constant.",
+    "inertia_error": "The residual torque on one side is proportional to that side's acceleration.",
     "input_delay": "The phase of the response lags in proportion to the frequency.",
     "gravity_load": "A torque on the load that depends on the load's angle alone, once a revolution of the output.",
     "load_disturbance": "A constant, or lines at frequencies that do not move with any shaft.",
