@@ -25,8 +25,10 @@ from fitting.attribution.support import (
     strength_errors,
 )
 from fitting.estimation.base_fit import leaves_white_noise
+from fitting.first_order.motion import place_of
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
+from hdjax.parameters import own_parameters
 
 # A candidate needs this share of the best gain after its first pass to be refitted further; ties have nearly the same
 # gain.
@@ -183,8 +185,8 @@ class _Refits:
                 self.done[lead.effect.name] = trial
 
     def _sibling(self, lead: Lead) -> Trial | None:
-        """The best refit so far with a form of the same family."""
-        refits = [t for t in self.done.values() if t.model.effects[-1].family == lead.effect.family]
+        """The best refit so far with a form of the same family, or one at the same place that shares parameters."""
+        refits = [t for t in self.done.values() if _are_siblings(lead.effect, t.model.effects[-1])]
         return min(refits, key=lambda trial: trial.training.objective, default=None)
 
     def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
@@ -212,6 +214,12 @@ class _Refits:
             gain = -np.inf if trial is None else trial.gain_over(self.before)
             found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
         return found
+
+
+def _are_siblings(effect: Effect, refitted: Effect) -> bool:
+    names, theirs = ({name for name, _ in own_parameters(e)} for e in (effect, refitted))
+    same_place = place_of(effect) is not None and place_of(effect) is place_of(refitted)
+    return effect.family == refitted.family or (same_place and not names.isdisjoint(theirs))
 
 
 def _supported_first(

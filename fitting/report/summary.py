@@ -14,6 +14,8 @@ _HARDLY = 0.1
 
 # A temperature from zero kelvin differs by parts of a kelvin only in its fourth digit.
 _DIGITS_OF_TEMPERATURE = 4
+# Where something is missing, if the equation of one side leaves only noise: not on that side.
+_WHERE_MISSING = {"motor equation": " on the load", "load equation": " on the motor"}
 _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
 
 
@@ -57,9 +59,8 @@ def _decision(report: Mapping[str, Any]) -> str:
         change = _change(subject, report, several=several)
         return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
     left = report["unexplained"]
-    opening = "Something is missing that the catalogue does not explain."
-    if families:
-        opening = f"A part was found ({found}), but something else is missing that the catalogue does not explain."
+    missing = f"missing{_WHERE_MISSING.get(report['parameters_from'], '')} that the catalogue does not explain."
+    opening = f"A part was found ({found}), but something else is {missing}" if families else f"Something is {missing}"
     if report["unknown"]:
         return f"{opening} {_change(f'A learned {_learned(report)},', report)}"
     beyond = left["free_runs_times_expected"]

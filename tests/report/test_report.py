@@ -141,6 +141,11 @@ def test_unexplained_error_of_free_runs_is_reported(loop: Loop):
     assert "1.40 times what noise and uncertainty allow" in found["summary"]
 
 
+def test_side_on_which_something_is_missing_is_told(loop: Loop):
+    found = report_dict(Loop(**{**vars(loop), "decision": "unexplained", "parameters_from": "motor equation"}))
+    assert "is missing on the load that the catalogue does not explain" in found["summary"]
+
+
 @pytest.mark.parametrize(("family", "told"), [("load_disturbance", True), ("motor_friction", False)])
 def test_time_offset_of_a_log_is_reported(loop: Loop, family: str, told: bool):
     """Where the model depends on time, the report lists the time offset of each log and that its phase is unknown."""
