@@ -44,6 +44,10 @@ _KEYS = {
     "signals": ("torque_hold", "sample_rate"),
     "columns": SIGNALS,
 }
+# Keys that may be sought in another table, and where they belong.
+_PLACES = {key: f"[{table}]" for table, keys in _KEYS.items() for key in keys} | {
+    "torque_constant": "motor_current in [columns], as in { column = \"iq\", torque_constant = 0.12 }"
+}
 
 
 @dataclass(frozen=True)
@@ -259,6 +263,8 @@ def _load(path: Path) -> dict[str, Any]:
 def _refuse_unknown(path: Path, kind: str, given: Iterable[str], known: Iterable[str]) -> None:
     for name in given:
         if name not in known:
+            if name in _PLACES:
+                raise InputError(f"{path}: '{name}' is no {kind}; it belongs to {_PLACES[name]}")
             raise InputError(
                 f"{path}: unknown {kind} '{name}'{did_you_mean(name, known)}; known are {', '.join(known)}"
             )
