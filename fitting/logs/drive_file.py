@@ -46,7 +46,7 @@ _KEYS = {
 }
 # Keys that may be sought in another table, and where they belong.
 _PLACES = {key: f"[{table}]" for table, keys in _KEYS.items() for key in keys} | {
-    "torque_constant": "motor_current in [columns], as in { column = \"iq\", torque_constant = 0.12 }"
+    "torque_constant": 'motor_current in [columns], as in { column = "iq", torque_constant = 0.12 }'
 }
 
 

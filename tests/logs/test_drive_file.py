@@ -48,7 +48,11 @@ def test_empty_drive_file_leaves_all_values_unset(tmp_path: Path) -> None:
     [
         ("[drive]", "[drives]", ["'drives'", "did you mean 'drive'?"]),
         ("reduction_ratio", "reducton_ratio", ["did you mean 'reduction_ratio'?"]),
-        ("[drive]", "[drive]\ntorque_constant = 0.1", ["'torque_constant'", "it belongs to motor_current in [columns]"]),
+        (
+            "[drive]",
+            "[drive]\ntorque_constant = 0.1",
+            ["'torque_constant'", "it belongs to motor_current in [columns]"],
+        ),
         ("[drive]", "[drive]\nsample_rate = 1e3", ["'sample_rate'", "it belongs to [signals]"]),
         ("reduction_ratio = 50", "reduction_ratio = 0", ["reduction_ratio", "positive"]),
         ("reduction_ratio = 50", "reduction_ratio = 0.0125", ["write 80 if it is inverted"]),
