@@ -118,9 +118,9 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
 
 
 def _with_form(model: Model, effect: Effect) -> Model:
-    """The model with an effect, which replaces the forms that it contains and takes over their parameters."""
+    """The model with an effect, which replaces the forms that it contains and takes over their strengths."""
     for narrow in (e for e in model.effects if e.name in effect.contains):
-        for name, _ in own_parameters(narrow):
+        for name in (n for n, info in own_parameters(narrow) if info.role == "strength"):
             sum_of_both = getattr(effect, name) + getattr(narrow, name)
             effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, sum_of_both)
         model = model.without_effect(narrow.name)

@@ -124,7 +124,8 @@ class Effect(eqx.Module):
             suitable.
         one_shape_of: the quantity that it is a specific function of; another function would be another effect.
         corrects: the parameter of the drive whose stated value it corrects.
-        contains: names of the forms that it contains, with the same symbols: it replaces them.
+        contains: names of the forms that it contains, with the same symbols: it replaces them and takes over their
+            strengths.
         imperfection: possible rms error of its law, as a share of the error that it removes: no form is exact.
     """
 

@@ -133,7 +133,7 @@ class StribeckMotorFriction(DryMotorFriction):
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "stribeck_motor_friction"
-    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
+    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction", "motor_friction")
 
     T_c: Scalar = parameter(
         0.0,
@@ -213,6 +213,7 @@ class StribeckLoadFriction(DryLoadFriction):
 
     family: ClassVar[str] = "load_friction"
     name: ClassVar[str] = "stribeck_load_friction"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_load_friction", "load_friction")
 
     T_c: Scalar = parameter(
         0.0, unit="N m", doc="Coulomb torque at the load", source="EFFECTS", bounds=(0.0, 1e4), role="strength"

@@ -142,7 +142,7 @@ class LuGreMotorFriction(_LuGre, MotorSideEffect):
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "lugre_motor_friction"
-    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
+    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction", "dahl_motor_friction")
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
