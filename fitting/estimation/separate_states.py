@@ -48,14 +48,15 @@ def solve_states(
     while steps < max_steps:
         steps += 1
         step, promised = _step(products, states.shape[1], dampings)
-        costs = [0.5 * float(np.sum(products[:, -1, -1])), *costs[:-1]]
+        squares = products[:, -1, -1]
+        costs = [0.5 * float(np.sum(squares[np.isfinite(squares)])), *costs[:-1]]
         done = np.abs(promised) < rtol * costs[0] / rows.size
         if done.all() or (least_progress > 0 and costs[-1] < (1.0 + least_progress) * costs[0]):
             break
         ahead = states + np.where(done[:, None], 0.0, step)
         seen, rows_ahead = look(Unknowns(start.parameters, ahead))
-        before, changed = 0.5 * products[:, -1, -1], 0.5 * (seen.products[:, -1, -1] - products[:, -1, -1])
-        taken = (changed <= KEPT * promised) | (np.abs(changed) < SLIGHT * before)
+        changed = 0.5 * (seen.products[:, -1, -1] - squares)
+        taken = (changed <= KEPT * promised) | (np.abs(changed) < 0.5 * SLIGHT * squares)
         well = changed < WELL * promised
         dampings = dampings / np.where(taken, np.where(well, LONGER, 1.0), SHORTER)
         dampings = np.maximum(dampings, LEAST_DAMPING)

@@ -6,13 +6,18 @@ import pytest
 
 import rig
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.candidate_refit import _as_sibling
+from fitting.attribution.candidate_refit import _as_sibling, _away_from_bounds
+from fitting.attribution.selection_round import _are_siblings
 from fitting.estimation.estimate import fit
 from fitting.estimation.experiment import whole
 from fitting.estimation.problem import Segmentation
 from hdjax import Model
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash, UndampedBacklash
+from hdjax.effects.effect import Scales
+from hdjax.effects.friction import LoadFriction, MotorFriction
+from hdjax.effects.position import PositionDependentMotorFriction
+from hdjax.effects.presliding import LuGreLoadFriction
 
 
 def trial_of(model: Model) -> Trial:
@@ -33,3 +38,23 @@ def test_a_sibling_that_replaced_an_effect_is_no_start():
     before = trial_of(rig.drive_model().with_effects(TorqueBias(bias=0.01)))
     replaced = replace(before, model=rig.drive_model().with_effects(Backlash(b=2e-4)))
     assert _as_sibling(UndampedBacklash(b=1e-5), before, replaced) is None
+
+
+def test_forms_at_one_place_with_common_parameters_start_from_each_other():
+    friction = MotorFriction(T_c=0.1, transition=0.1)
+    assert _are_siblings(friction, PositionDependentMotorFriction(T_c=0.1, transition=0.1))
+    assert not _are_siblings(friction, LoadFriction(T_c=0.1, transition=0.1))
+    assert not _are_siblings(TorqueBias(bias=0.1), friction)
+
+
+def test_parameter_at_its_bound_starts_again_from_typical_values():
+    """LuGre friction whose Stribeck rate has run away is Dahl friction."""
+    scales = Scales(x=2e-4, x_max=1e-3, v=0.03, omega_m=15.0, omega_l=0.15, time_step=1e-3, omega_0=400.0)
+    friction = LuGreLoadFriction(T_c=0.5, excess=2.6, omega_s=2e13, bend=9e-5, tau=7e-4, settling=2e-4)
+    model = rig.drive_model().with_effects(friction)
+    starts = _away_from_bounds(model, friction, scales)
+    rates = [float(start.get("lugre_load_friction.omega_s")) for start in starts]
+    assert sorted(rates) == sorted({float(p.omega_s) for p in LuGreLoadFriction.proposals(scales)})
+    assert {float(start.get("lugre_load_friction.excess")) for start in starts} == {2.6}
+    settled = model.replace({"lugre_load_friction.omega_s": 0.03})
+    assert _away_from_bounds(settled, friction, scales) == []
