@@ -65,14 +65,18 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
     )
 
 
-def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = RULES) -> Check:
-    """Whether a candidate is tied with the chosen one: one-sided test of paired differences over blocks.
+def tie(name: str, behind: Float[np.ndarray, " blocks"], lost: float = np.inf, rules: DecisionRules = RULES) -> Check:
+    """Whether a candidate is tied with the chosen one: one-sided test of paired differences over blocks. A difference
+    below the least gain is none.
 
     Args:
         name: of the candidate.
         behind: log predictive density of the chosen one minus that of the candidate, block by block.
+        lost: gain of the chosen one minus that of the candidate.
         rules: the thresholds.
     """
+    if lost < rules.least_gain:
+        return Check("least_gain", name, lost, rules.least_gain, True)
     count = behind.size
     if count < 2:
         return Check("tie_level", name, 0.0, np.inf, True)
@@ -265,7 +269,7 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
     checks: list[Check] = []
     lacking: list[str] = []
     for number, this in enumerate(evidence.rounds, start=1):
-        checks += [tie(name, np.array(behind), rules) for name, behind in this.behind.items()]
+        checks += [tie(name, np.array(behind), rules=rules) for name, behind in this.behind.items()]
         supported = [support(seen, rules) for seen in this.asked]
         checks += [check for those in supported for check in those]
         last = number == len(evidence.rounds)

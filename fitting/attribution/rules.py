@@ -24,7 +24,7 @@ class DecisionRules:
     least_gain: float = _rule(
         1e-3,
         "log of rms error",
-        "smallest decrease of the error that counts where noise does not explain it: a tenth of a percent",
+        "smallest decrease of the error that counts where noise does not explain it, and between candidates",
         "solver errors may cause as much",
     )
     tie_level: float = _rule(

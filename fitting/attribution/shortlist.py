@@ -76,11 +76,23 @@ def _simplest(leads: Sequence[Lead]) -> Lead:
     return min(leads, key=order)
 
 
-def possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:
-    """Possible ties of the best form, which leaves only noise: other families, and forms of its family with a larger
-    first-order gain."""
+def possible_ties(leads: Sequence[Lead], first: Sequence[Lead], suspects: Sequence[Lead] = ()) -> list[Lead]:
+    """Possible ties of the best form, which leaves only noise: other families, each with the forms that are equal to
+    its first one to first order, and forms of its family with a larger first-order gain.
+
+    Args:
+        leads: all forms that may be refitted.
+        first: the first form of each family, best first.
+        suspects: forms that base parameters may imitate; their gain does not matter.
+    """
     leader = first[0]
-    others = [lead for lead in first[1:] if lead.gain >= _POSSIBLE_TIE * leader.gain]
+    others = [
+        lead
+        for best in first[1:]
+        if best in suspects or best.gain >= _POSSIBLE_TIE * leader.gain
+        for lead in leads
+        if lead.effect.family == best.effect.family and abs(lead.gain - best.gain) <= _THE_SAME * best.gain
+    ]
     forms = [a for a in leads if a.effect.family == leader.effect.family and a.gain > leader.gain and a is not leader]
     return others + forms[:_FORMS]
 

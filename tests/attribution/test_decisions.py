@@ -63,6 +63,12 @@ def test_candidates_tie_if_scatter_over_blocks_explains_their_difference():
     assert tie("a", np.full(1, 9.0)).holds
 
 
+def test_difference_below_the_least_gain_is_a_tie():
+    worse = np.full(4, 9.0)
+    assert tie("a", worse, 0.5 * RULES.least_gain).holds
+    assert not tie("a", worse, 2.0 * RULES.least_gain).holds
+
+
 def test_tie_test_keeps_its_level():
     random = np.random.default_rng(1)
     draws = random.normal(size=(4000, 12))

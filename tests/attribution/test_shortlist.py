@@ -3,7 +3,7 @@
 import numpy as np
 
 from fitting.attribution.screening import Lead, Screen
-from fitting.attribution.shortlist import first_of_each_family, further_forms, worth_a_refit
+from fitting.attribution.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.creep import Creep
@@ -42,6 +42,12 @@ def test_catalogue_order_decides_between_equal_first_order_gains():
     assert first_of_each_family(same) == same[1:]
     more = [Lead(UndampedBacklash(b=0.0), {}, 0.002), Lead(Backlash(b=0.0), {}, 0.002 * (1.0 - 1e-3))]
     assert first_of_each_family(more) == more[:1]
+
+
+def test_ties_include_forms_that_are_equal_to_first_order():
+    equal = Lead(UndampedBacklash(b=0.0), {}, GAP.gain * (1.0 + 1e-13))
+    assert possible_ties([CREEP, QUADRATIC, GAP, equal], [CREEP, QUADRATIC, GAP]) == [QUADRATIC]
+    assert possible_ties([CREEP, QUADRATIC, GAP, equal], [CREEP, QUADRATIC, GAP], [GAP]) == [QUADRATIC, GAP, equal]
 
 
 def test_form_with_several_states_needs_a_far_larger_gain_to_go_first():
