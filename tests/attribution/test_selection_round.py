@@ -168,7 +168,7 @@ def test_ties_are_those_of_the_first_candidate(verdicts, monkeypatch: pytest.Mon
         0.8: np.array([0.0, 0.4, 0.6, 4.7]),
     }
     monkeypatch.setattr(attribution, "block_scores", lambda trial, whitening: blocks[trial.lasting])
-    candidates = [Verdict(n, "family", t, 1.0, 0.001, True) for n, t in zip(names, trials, strict=True)]
+    candidates = [Verdict(n, "family", t, t.lasting, 0.001, True) for n, t in zip(names, trials, strict=True)]
 
     def tied(order: list[Verdict]) -> list[str]:
         return [v.name for v in attribution._with_ties(order)[0] if not v.separable]
