@@ -19,6 +19,7 @@ from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.estimation.one_side import held_at
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.one_side_check import better_side
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
 from fitting.uncertainty.one_side import without_mesh_priors
@@ -86,6 +87,8 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     study.progress("final fit over long horizons")
     current = trusted if unknown is None else unknown.trial
     fitted, side = _fitted_to_the_end(current.training, seen, study)
+    names = {e.name for e in trusted.model.effects}
+    seen = replace(seen, at_bounds=sum(len(parameters_at_bounds(fitted.model, name)) for name in names))
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}

@@ -169,6 +169,7 @@ class FinalEvidence:
         excess_at_first: likewise of the base model.
         noise_explains: whether coloured noise of sensors and torque explains the residual.
         surprise: free-run error over its prediction band; None where that is not checked.
+        at_bounds: parameters of the named effects that ended at a bound in the final fit.
     """
 
     names: tuple[str, ...]
@@ -177,6 +178,7 @@ class FinalEvidence:
     excess_at_first: tuple[float, ...]
     noise_explains: bool = False
     surprise: float | None = None
+    at_bounds: int = 0
 
 
 @dataclass(frozen=True)

@@ -233,6 +233,9 @@ def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome
         Check("explained", "variance that they remove", share, rules.explained, share >= rules.explained),
     ]
     found = any(check.holds for check in checks) or (seen.noise_explains and not seen.learned)
+    most = rules.at_bounds
+    checks.append(Check("at_bounds", "final fit", float(seen.at_bounds), most, seen.at_bounds <= most))
+    found = found and checks[-1].holds
     if found and seen.surprise is not None:
         as_promised = seen.surprise <= rules.surprise
         checks.append(

@@ -63,6 +63,12 @@ def test_candidates_tie_if_scatter_over_blocks_explains_their_difference():
     assert tie("a", np.full(1, 9.0)).holds
 
 
+def test_effect_with_a_parameter_at_its_bound_in_the_final_fit_explains_nothing():
+    assert conclude(FINAL)[0] == "effect_found"
+    outcome, checks = conclude(replace(FINAL, at_bounds=1))
+    assert outcome == "unexplained" and not next(c for c in checks if c.rule == "at_bounds").holds
+
+
 def test_difference_below_the_least_gain_is_a_tie():
     worse = np.full(4, 9.0)
     assert tie("a", worse, 0.5 * RULES.least_gain).holds
