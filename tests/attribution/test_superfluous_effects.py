@@ -12,7 +12,7 @@ import rig
 from fitting.attribution import effect_search
 from fitting.attribution.candidate_refit import _with_form
 from fitting.loop import close_loop
-from hdjax.effects import BY_NAME, CATALOGUE, Effect
+from hdjax.effects import BY_NAME, CATALOGUE, Creep, Effect, GravityLoad
 from hdjax.effects.friction import MotorFriction, ViscousLoadFriction, ViscousMotorFriction
 
 COUNT, B = 3000, 2e-5
@@ -49,14 +49,17 @@ def test_loop_finds_the_simplest_sufficient_form(friction: tuple[float, float], 
         np.testing.assert_allclose(float(loop.after.model.get("viscous_motor_friction.b")), B, rtol=0.05)
 
 
+def trial(objective: float, *effects: Effect) -> Any:
+    return SimpleNamespace(
+        held_out=SimpleNamespace(objective=objective), model=rig.drive_model().with_effects(*effects)
+    )
+
+
 @pytest.mark.parametrize("better", [True, False])
 def test_hold_made_superfluous_by_later_effects_is_dropped(monkeypatch: pytest.MonkeyPatch, better: bool):
     """A base model without friction may follow a log better under a wrong hold."""
 
-    def trial(objective: float) -> Any:
-        return SimpleNamespace(held_out=SimpleNamespace(objective=objective))
-
-    current, reverted, poor = trial(-20.0), trial(-22.0 if better else -19.0), trial(-10.0)
+    current, reverted, poor = (trial(objective) for objective in (-20.0, -22.0 if better else -19.0, -10.0))
     refits = {"linear hold": reverted, "motor_friction": poor}
     monkeypatch.setattr(effect_search, "refitted_without", lambda names, *_: refits[names[0]])
     found, dropped, without = effect_search._without_superfluous(list(refits), current, trial(0.0), cast(Any, None))
@@ -66,9 +69,20 @@ def test_hold_made_superfluous_by_later_effects_is_dropped(monkeypatch: pytest.M
 
 
 def test_last_effect_is_dropped_where_the_others_improved_beside_it(monkeypatch: pytest.MonkeyPatch):
-    current, equal, poor = (SimpleNamespace(held_out=SimpleNamespace(objective=o)) for o in (-20.0, -20.0, -10.0))
+    current, equal, poor = (trial(objective) for objective in (-20.0, -20.0, -10.0))
     refits = {"load_friction": poor, "cubic_damping": equal}
     monkeypatch.setattr(effect_search, "refitted_without", lambda names, *_: refits[names[0]])
     arguments = cast(Any, (list(refits), current, poor, None))
     found, dropped, _ = effect_search._without_superfluous(*arguments)
     assert dropped == ["cubic_damping"] and found is equal
+
+
+def test_effect_whose_parameter_ended_at_a_bound_is_dropped(monkeypatch: pytest.MonkeyPatch):
+    """Creep that takes forever is no creep."""
+    slow, gravity = Creep(k=1.0, tau=1e20, span=1.0), GravityLoad(sine=1.0)
+    current, without_creep, base = trial(-20.0, slow, gravity), trial(-12.0, gravity), trial(-5.0)
+    monkeypatch.setattr(effect_search, "refitted_without", lambda names, *_: without_creep)
+    found, dropped, _ = effect_search._without_superfluous(["creep", "gravity_load"], current, base, cast(Any, None))
+    assert dropped == ["creep"] and found is without_creep
+    found, dropped, _ = effect_search._without_superfluous(["creep"], trial(-20.0, slow), base, cast(Any, None))
+    assert dropped == ["creep"] and found is base
