@@ -292,10 +292,11 @@ def parameters_at_bounds(model: Model, name: str) -> list[str]:
 # Parameters without any information are not at a bound.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
-    """Fixed values of the drive file that the fit relies on."""
+    """Fixed values of the drive file that the fit relies on; an effect may correct one."""
     if not isinstance(fit.model, TwoInertiaModel):
         return ()
-    held = tuple(p for p in _HELD if p not in fit.free.paths)
+    free = {*fit.free.paths, *(effect.corrects for effect in fit.model.effects)}
+    held = tuple(p for p in _HELD if p not in free)
     if not held:
         return ()
     products = np.asarray(_products(fit, held))

@@ -46,6 +46,7 @@ def test_loop_finds_a_stated_inertia_that_is_wrong(path: str, gravity: float):
     (inertia,) = loop.after.model.effect(form.name).derived(drive).values()
     assert float(inertia[0]) == pytest.approx(true, rel=1e-3)
     assert loop.parameters_from == "torque"
+    assert path not in {held.path for held in loop.after.identifiability.held}
     K = loop.after.uncertainty.estimates["K"]
     assert K.ci95[0] < rig.K < K.ci95[1]
 
