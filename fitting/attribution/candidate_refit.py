@@ -40,7 +40,7 @@ def begin(before: Trial, lead: Lead, study: Study, *, sibling: Trial | None = No
         before: the current model.
         lead: the effect.
         study: the data, and how they are cut.
-        sibling: a refit with another form of its family, whose values are one more start.
+        sibling: a refit with a form of its family or at its place, whose values are one more start.
     """
     model = before.model
     if contradicts(lead.effect, study.side):

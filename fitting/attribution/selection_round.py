@@ -252,14 +252,12 @@ def _reaches(trial: Trial | None, objective: float) -> bool:
 def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], dict[str, tuple[float, ...]]]:
     """The candidates, with ties of the first one marked; and the score difference of each refitted one, block by
     block."""
-    best = verdicts[0] if verdicts else None
-    first = None if best is None else best.trial
-    if best is None or first is None:
+    if not verdicts or (first := verdicts[0].trial) is None:
         return verdicts, {}
     whitening = np.asarray(first.held_out.problem.whitening)
     reference = block_scores(first, whitening)
     behind = {v.name: reference - block_scores(v.trial, whitening) for v in verdicts if v.trial is not None}
-    ties = {v.name: tie(v.name, behind[v.name], best.gain - v.gain) for v in verdicts if v.name in behind}
+    ties = {v.name: tie(v.name, behind[v.name], verdicts[0].gain - v.gain) for v in verdicts if v.name in behind}
     apart = [v.name not in ties or not ties[v.name].holds for v in verdicts]
     marked = [eqx.tree_at(lambda v: v.separable, v, a) for v, a in zip(verdicts, apart, strict=True)]
     return marked, {name: tuple(map(float, blocks)) for name, blocks in behind.items()}

@@ -194,15 +194,16 @@ def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
 
 
 def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle: float = STEP_ANGLE) -> int:
-    """Solver steps in a sample interval that resolve the fastest oscillation.
+    """Solver steps in a sample interval that resolve the fastest oscillation, and in which bristles are stable.
 
     Args:
         model: supplies the natural frequency.
         stretches: supply the sample interval and the largest twist.
         step_angle: largest phase advance of the oscillation per step [rad].
     """
-    angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
-    return int(np.clip(np.ceil(angle / step_angle), 1, 16))
+    time_step = stretches[0].experiment.time_step
+    angle = natural_frequency(model, stretches) * time_step
+    return max(int(np.clip(np.ceil(angle / step_angle), 1, 16)), stable_substeps(model, time_step))
 
 
 def stable_substeps(model: Model, time_step: float) -> int:

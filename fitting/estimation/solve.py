@@ -4,8 +4,6 @@ What takes long is to look at a problem, by the model's machine code or by a pro
 little work, for which a program would take longer to compile than it saves.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +13,7 @@ from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.machine_code import task
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
-from fitting.estimation.separate_states import solve_states
+from fitting.estimation.separate_states import Look, solve_states
 from hdjax.compilation import jit_small, on_host
 from hdjax.lanes import on_one_device, placed_like
 
@@ -70,9 +68,26 @@ def solve(
         damping: of the first step, see [`FIRST_DAMPING`][].
         least_progress: share of the sum of squares that a few steps must take off it for the iteration to go on.
     """
+    look, begin = _sight_of(problem, start), on_host(start)
+    separate = not (np.asarray(problem.active).any() or np.asarray(problem.segments.joined).any())
+    # What runs away is no warning: it is a step that is not taken.
+    with np.errstate(all="ignore"):
+        if separate:
+            rtol = ArrowLevenbergMarquardt.rtol
+            limits = {"rtol": rtol, "least_progress": least_progress}
+            best, found, success, steps = solve_states(look, begin, max_steps, damping, **limits)
+        else:
+            best, found, success, steps = _solve_together(problem, look, begin, max_steps, damping, least_progress)
+    unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
+    return Solution(unknowns, _left_over(problem, found), success, steps)
+
+
+def _solve_together(
+    problem: Problem, look: Look, best: Unknowns, max_steps: int, damping: float, least_progress: float
+) -> tuple[Unknowns, Array | np.ndarray, bool, int]:
+    """The iteration where segments share parameters or are joined: the unknowns, the rows of their residual, whether it
+    met its tolerance, and the number of steps."""
     segments = problem.segments
-    if not (np.asarray(problem.active).any() or np.asarray(segments.joined).any()):
-        return _states_alone(problem, start, max_steps, damping, least_progress)
     solver = ArrowLevenbergMarquardt(
         joined=np.asarray(segments.joined),
         gap_weight=np.asarray(problem.gap_weight),
@@ -82,37 +97,20 @@ def solve(
         longest=np.where(problem.free.logarithmic, _LONGEST_LOG, np.inf),
         least_progress=np.asarray(least_progress),
     )
-    look, best = _sight_of(problem, start), on_host(start)
     seen, rows = look(best)
     state = solver.init(_function, best, seen, {}, None, seen, frozenset())
-    found, done, late = rows, False, False
-    # What runs away is no warning: it is a step that is not taken.
-    with np.errstate(all="ignore"):
-        while True:
-            best, state, _ = solver.step(_function, best, seen, {}, state, frozenset())
-            found = rows if state.accepted else found
-            done, late = solver.ended(best, state)
-            finite = np.all(np.isfinite(best.parameters)) and np.all(np.isfinite(best.states))
-            if done or late or not finite:
-                break
-            seen, rows = look(state.ahead)
-    unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
-    return Solution(unknowns, _left_over(problem, found), bool(done and finite), int(state.count))
+    found = rows
+    while True:
+        best, state, _ = solver.step(_function, best, seen, {}, state, frozenset())
+        found = rows if state.accepted else found
+        done, late = solver.ended(best, state)
+        finite = np.all(np.isfinite(best.parameters)) and np.all(np.isfinite(best.states))
+        if done or late or not finite:
+            return best, found, bool(done and finite), int(state.count)
+        seen, rows = look(state.ahead)
 
 
-def _states_alone(problem: Problem, start: Unknowns, max_steps: int, damping: float, least_progress: float) -> Solution:
-    """Least squares of initial states with fixed parameters."""
-    look, begin = _sight_of(problem, start), on_host(start)
-    rtol = ArrowLevenbergMarquardt.rtol
-    with np.errstate(all="ignore"):
-        best, found, done, steps = solve_states(
-            look, begin, max_steps, damping, rtol=rtol, least_progress=least_progress
-        )
-    unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
-    return Solution(unknowns, _left_over(problem, found), done, steps)
-
-
-def _sight_of(problem: Problem, start: Unknowns) -> Callable[[Unknowns], tuple[Products, Array | np.ndarray]]:
+def _sight_of(problem: Problem, start: Unknowns) -> Look:
     """How a problem is looked at: its normal equations at some unknowns, and the rows of its residual."""
     looked_at = task(problem, start)
     if looked_at is not None:

@@ -13,7 +13,7 @@ from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, lost
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.linear_response import Followed, follow
-from fitting.estimation.problem import STEP_ANGLE, stable_substeps, suggested_substeps
+from fitting.estimation.problem import STEP_ANGLE, suggested_substeps
 from fitting.estimation.projection import Answers, without_undetermined
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.segments import Segments
@@ -179,8 +179,7 @@ def _linearised(fit: Fit) -> tuple[Problem, Unknowns]:
     segments, states = jax.tree.map(
         lambda a: jnp.asarray(np.asarray(a)[:count]), (problem.segments, fit.unknowns.states)
     )
-    # Held-out fits fix their parameters; here all of them are free. Sensitivities need no more solver steps than this,
-    # or than bristles need to be stable; the residual is that of the fit.
-    needed = suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE)
-    substeps = max(needed, stable_substeps(fit.model, fit.stretches[0].experiment.time_step))
+    # Held-out fits fix their parameters; here all of them are free. Sensitivities need no more solver steps than this;
+    # the residual is that of the fit.
+    substeps = suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE)
     return replace(problem, segments=segments, substeps=substeps), replace(fit.unknowns, states=states)

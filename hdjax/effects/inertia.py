@@ -30,6 +30,16 @@ class _InertiaError(ShaftEffect):
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return jnp.zeros_like(drive.J_l)
 
+    def inertia_taken(self, drive: Drive) -> Array:
+        return -self.error * self._stated(drive)
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {"inertia": ((1.0 + self.error) * self._stated(drive), "kg m^2")}
+
+    def _stated(self, drive: Drive | ReducedDrive) -> Array:
+        assert self.corrects is not None
+        return getattr(drive, self.corrects)
+
 
 class MotorInertiaError(_InertiaError, MotorSideEffect):
     """The motor's inertia is `(1 + error) J_m`, where J_m is the stated one."""
@@ -37,23 +47,9 @@ class MotorInertiaError(_InertiaError, MotorSideEffect):
     name: ClassVar[str] = "motor_inertia_error"
     corrects: ClassVar[str | None] = "J_m"
 
-    def inertia_taken(self, drive: Drive) -> Array:
-        return -self.error * drive.J_m
-
-    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        assert isinstance(drive, Drive)
-        return {"inertia": ((1.0 + self.error) * drive.J_m, "kg m^2")}
-
 
 class LoadInertiaError(_InertiaError, LoadSideEffect):
     """The load's inertia is `(1 + error) J_l`, where J_l is the stated one."""
 
     name: ClassVar[str] = "load_inertia_error"
     corrects: ClassVar[str | None] = "J_l"
-
-    def inertia_taken(self, drive: Drive) -> Array:
-        return -self.error * drive.J_l
-
-    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        assert isinstance(drive, Drive)
-        return {"inertia": ((1.0 + self.error) * drive.J_l, "kg m^2")}
