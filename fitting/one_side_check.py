@@ -9,15 +9,14 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import with_priors
 from fitting.estimation.one_side import fits_of_sides, stiffness_error, with_known_priors
 from fitting.estimation.starting_values import sees_twist
-from fitting.uncertainty.one_side import leaves_only_noise
+from fitting.uncertainty.one_side import contradicts, leaves_only_noise
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import OneSideModel, TwoInertiaModel
 
 
 def better_side(found: Fit) -> Fit | None:
     """The fit of one side whose own equation leaves only noise, if that excludes the model's K or determines it better.
-    None also where an inertia is wrong: an effect corrects it, or both sides leave only noise and contradict each
-    other.
+    None also where both sides leave only noise and contradict each other: a stated inertia is wrong.
 
     Args:
         found: the fit of a model that leaves more than noise.
@@ -25,10 +24,12 @@ def better_side(found: Fit) -> Fit | None:
     model = found.model
     if not isinstance(model, TwoInertiaModel) or not sees_twist(found.stretches):
         return None
-    if any(effect.corrects for effect in model.effects):
-        return None
     fits = fits_of_sides(with_priors(TwoInertiaModel(model.drive), ()), found.stretches)
-    good = [one for one in fits if leaves_only_noise(one, found, most=RULES.excess)]
+    good = [
+        one
+        for one in fits
+        if leaves_only_noise(one, found, most=RULES.excess) and not any(contradicts(e, one) for e in model.effects)
+    ]
     sides = [with_known_priors(one, model.drive.priors) for one in sorted(good, key=stiffness_error)]
     own, *told = (uncertainty(one).estimates["K"] for one in (found, *sides))
     if not told or max(e.ci95[0] for e in told) > min(e.ci95[1] for e in told):

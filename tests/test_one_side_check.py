@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import joints
+import rig
 from fitting.estimation.estimate import Fit, fit
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import MESH, base_paths
@@ -74,6 +76,27 @@ def test_sides_that_contradict_each_other_supply_nothing():
 
 def test_side_whose_inertia_is_unknown_supplies_nothing():
     assert better_side(wrong_law(RUBBING["load equation"], Prior("J_l", SMOOTH.J_l, np.inf))) is None
+
+
+def test_side_driven_by_late_readings_supplies_nothing():
+    """Readings late by 0.4 rows of a load that travels far: the motor's equation leaves only noise beside a viscous
+    friction, with a damping that is a third off."""
+    joint, late = dataclasses.replace(SMOOTH, alpha=0.0, B_sp=0.8), 0.4 * joints.STEP
+    log = joints.log_of(joint, count=3000)
+    motion = CubicSpline(log.time, joints.motion_of(joint, log.motor_torque))(log.time - late)[:, 1]
+    noise = log.load_angle - joints.motion_of(joint, log.motor_torque)[:, 1]
+    log = rig.log_of_angles(
+        log.motor_angle, motion + noise, log.motor_torque, ratio=joint.N, step=joints.STEP, name="late"
+    )
+    experiment = experiment_from_log(log, hold="zero-order", N=joint.N)
+    model = TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=1.0))
+    loop = close_loop(model, {"zero-order": (experiment,)}, hold="zero-order")
+    assert loop.decision == "effect_found"
+    assert [f.name for f in loop.findings] == ["load_encoder_delay"]
+    assert loop.parameters_from == "torque"
+    known = loop.after.uncertainty.estimates
+    for path, true in {"K": joint.K, "B_sp": joint.B_sp, "load_encoder_delay.delay": late}.items():
+        assert abs(known[path].value - true) < 4.0 * known[path].std, (path, known[path])
 
 
 def test_loop_finds_gravity_behind_the_friction_of_the_motor():

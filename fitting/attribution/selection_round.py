@@ -27,6 +27,7 @@ from fitting.attribution.support import (
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.first_order.motion import place_of
 from fitting.uncertainty.identifiability import parameters_at_bounds
+from fitting.uncertainty.one_side import corrects_scale
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
@@ -156,7 +157,11 @@ class _Refits:
         before = self.before
         worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
         swing = self.study.scales(before.training.stretches, before.model)
-        behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
+        behind = [
+            lead
+            for lead in screened.leads
+            if lead.effect.imitated(before.model.drive, swing) or corrects_scale(lead.effect, self.study.side)
+        ]
         suspects = [lead for lead in behind if lead not in worth]
         first = first_of_each_family(worth, suspects)
         self._refit(first[:1], self.study)
