@@ -61,7 +61,13 @@ def begin(before: Trial, lead: Lead, study: Study, *, sibling: Trial | None = No
     near = [before.training] * len(starts)
     if sibling is not None and (model := _as_sibling(lead.effect, before, sibling)) is not None:
         starts, near = [*starts, model], [*near, sibling.training]
-    return first_pass(starts, study, before.hold, near=near, champion=before, own_states=lead.own_states)
+    found = first_pass(starts, study, before.hold, near=near, champion=before, own_states=lead.own_states)
+    if found.objective <= before.training.objective:
+        return found
+    # Without strength it is the current model: the first-order estimates lead away from that.
+    start = _with_form(model, _with_positive_strengths(_without_strength(lead.effect)))
+    again = first_pass([start], study, before.hold, champion=before, own_states=lead.own_states)
+    return min(found, again, key=lambda fit: fit.objective)
 
 
 def _as_sibling(effect: Effect, before: Trial, sibling: Trial) -> Model | None:
@@ -125,6 +131,12 @@ def _with_form(model: Model, effect: Effect) -> Model:
             effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, sum_of_both)
         model = model.without_effect(narrow.name)
     return model.with_effects(effect)
+
+
+def _without_strength(effect: Effect) -> Effect:
+    for name in (n for n, info in own_parameters(effect) if info.role == "strength"):
+        effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(0.0))
+    return effect
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:

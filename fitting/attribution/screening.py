@@ -16,7 +16,7 @@ from jaxtyping import Float
 from typing_extensions import TypeVar
 
 from fitting.estimation.estimate import Fit
-from fitting.estimation.free_parameters import strength_paths
+from fitting.estimation.free_parameters import MESH, strength_paths
 from fitting.estimation.scales import scales
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import (
@@ -29,6 +29,7 @@ from fitting.first_order.linearised_fit import (
 )
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
+from fitting.uncertainty.one_side import contradicts
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, ActuatorEffect, Effect, applicable
 
@@ -79,6 +80,7 @@ def screen(
     *,
     catalogue: Sequence[type[Effect]] = CATALOGUE,
     seed: int = 0,
+    side: Fit | None = None,
 ) -> Screen:
     """Screen every form that the current model lacks.
 
@@ -87,6 +89,7 @@ def screen(
         held_out: the same model's parameters on held-out stretches (states fitted, parameters held).
         catalogue: candidate forms.
         seed: of the surrogates.
+        side: the fit of one side's equation that the priors of K, alpha and B_sp are from.
     """
     model = training.model
     present = {name for e in model.effects for name in (e.name, *e.contains)}
@@ -104,6 +107,8 @@ def screen(
     for effect, own, states, (fitted, unseen) in _responses(training, held_out, proposals, seed, strays=strays):
         used = [*range(known), *(skipped + known + c for c in own)]
         fitted, unseen = fitted.columns(used), unseen.columns(used)
+        if known:
+            fitted = fitted.beside_prior(*_priors(training, without_mesh=contradicts(effect, side)))
         if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
             # Its response diverges along this motion: nothing is known to first order.
             continue
@@ -121,6 +126,15 @@ def screen(
         leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
+
+
+def _priors(fit: Fit, *, without_mesh: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Deviation of each free parameter from its prior mean, in standard deviations, and its derivative by the
+    parameter; without those of K, alpha and B_sp if asked."""
+    free = fit.free
+    held = [not (without_mesh and path in MESH) for path in free.paths]
+    slope = np.asarray(free.precision) / np.asarray(free.slopes(fit.model)) * held
+    return np.asarray(free.off_prior(free.pack(fit.model))), slope
 
 
 def _responses(

@@ -117,7 +117,7 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     """
     before = standing.before
     study.progress("screening the catalogue")
-    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=study.seed)
+    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=study.seed, side=study.side)
     refits = _Refits(before, study)
     refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
     found = [*refits.forms(screened), *(refits.holds(screened) if standing.excused else [])]

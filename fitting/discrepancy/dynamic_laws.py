@@ -97,7 +97,7 @@ def screen_memory(before: Trial, seen: SearchContext, study: Study, *, least: fl
     taken = {place_of(e) for e in before.model.effects if e.states}
     forms = [form for form in LEARNED_WITH_MEMORY if place_of(form) not in taken]
     study.progress("screening torques with memory")
-    screened = screen(before.training, before.held_out, catalogue=forms, seed=study.seed)
+    screened = screen(before.training, before.held_out, catalogue=forms, seed=study.seed, side=study.side)
     worth = worth_a_refit(screened, least=least)
     return MemoryScreen(tuple(MemoryCandidate(lead, _known(lead, seen)) for lead in worth), screened)
 

@@ -1,5 +1,6 @@
 """Surrogates: residuals of the same spectrum with random phases."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -113,12 +114,14 @@ class Scores(Record):
         gram: of the columns: first of free parameters, then of strengths.
         gradient: columns against the residual.
         surrogate_gradients: columns against each surrogate.
+        square: of the residual.
         samples: number of valid ones, at least one.
     """
 
     gram: Float[np.ndarray, "columns columns"]
     gradient: Float[np.ndarray, " columns"]
     surrogate_gradients: Float[np.ndarray, "columns draws"]
+    square: float
     samples: float
 
     @classmethod
@@ -135,12 +138,25 @@ class Scores(Record):
             gram = flat.T @ flat
         # Where the model diverges in every segment, there are no valid samples.
         samples = max(float(np.sum(weight)), 1.0)
-        return cls(gram, flat.T @ residual.reshape(-1), surrogates.against(columns), samples)
+        error = residual.reshape(-1)
+        return cls(gram, flat.T @ error, surrogates.against(columns), float(error @ error), samples)
 
     def columns(self, which: list[int]) -> "Scores":
         """The scores of some columns."""
         own = self.gram[np.ix_(which, which)], self.gradient[which], self.surrogate_gradients[which]
-        return Scores(*own, self.samples)
+        return Scores(*own, self.square, self.samples)
+
+    def beside_prior(self, off: Float[np.ndarray, " free"], slope: Float[np.ndarray, " free"]) -> "Scores":
+        """With the priors of the first columns' parameters; surrogates are of the data alone.
+
+        Args:
+            off: deviation of each parameter from its prior mean, in standard deviations.
+            slope: its derivative by the parameter; zero without a prior.
+        """
+        gram, gradient, own = self.gram.copy(), self.gradient.copy(), range(slope.size)
+        gram[own, own] += slope**2
+        gradient[: slope.size] -= slope * off
+        return replace(self, gram=gram, gradient=gradient)
 
     def steps(
         self, gradient: Float[np.ndarray, "columns draws"], chosen: list[int]
@@ -160,7 +176,7 @@ class Scores(Record):
 
 def null_gains(fitted: Scores, unseen: Scores, known: int) -> Float[np.ndarray, " draws"]:
     """Gain of a least-squares step on held-out surrogates, relative to refitting the free parameters (the first
-    columns).
+    columns): at most the whole residual, which the extrapolation of a curved law would exceed.
 
     Args:
         fitted: scores of the training data.
@@ -171,4 +187,4 @@ def null_gains(fitted: Scores, unseen: Scores, known: int) -> Float[np.ndarray, 
     partners = np.subtract.outer(np.arange(DRAWS), np.arange(PARTNERS)).T.ravel() % DRAWS
     against = unseen.surrogate_gradients[:, partners]
     before, after = (unseen.loss(np.tile(step, PARTNERS), against) for step in steps)
-    return before - after
+    return np.minimum(before - after, unseen.square / (2 * unseen.samples))
