@@ -59,8 +59,8 @@ def begin(before: Trial, lead: Lead, study: Study, *, sibling: Trial | None = No
         *(_with_form(model.replace(values), effect) for values, effect in lead.effect.imitated(model.drive, swing)),
     ]
     near = [before.training] * len(starts)
-    if sibling is not None and (model := _as_sibling(lead.effect, before, sibling)) is not None:
-        starts, near = [*starts, model], [*near, sibling.training]
+    if sibling is not None and (alike := _as_sibling(lead.effect, before, sibling)) is not None:
+        starts, near = [*starts, alike], [*near, sibling.training]
     found = first_pass(starts, study, before.hold, near=near, champion=before, own_states=lead.own_states)
     if found.objective <= before.training.objective:
         return found

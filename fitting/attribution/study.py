@@ -68,8 +68,8 @@ class Study:
         return replace(scales(stretches, model), load_late=self.load_late)
 
     def side_of(self, model: Model) -> Fit | None:
-        """The side whose equation determines a model's K, alpha and B_sp; None without any, or where an effect corrects
-        a stated value that these are in proportion to."""
+        """The side whose equation determines a model's K, alpha and B_sp; None without any, or where an effect
+        contradicts it."""
         return None if any(contradicts(effect, self.side) for effect in model.effects) else self.side
 
     def lacking(self, model: Model) -> type[Effect] | None:

@@ -5,11 +5,14 @@ from dataclasses import replace
 import pytest
 
 import rig
-from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.candidate_refit import _as_sibling, _away_from_bounds
+from fitting.attribution.candidate_fit import Trial, first_pass
+from fitting.attribution.candidate_refit import _as_sibling, _away_from_bounds, begin
+from fitting.attribution.screening import Lead
 from fitting.attribution.selection_round import _are_siblings
+from fitting.attribution.study import Setting, Study
 from fitting.estimation.estimate import fit
 from fitting.estimation.experiment import whole
+from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
 from hdjax import Model
 from hdjax.effects.actuation import TorqueBias
@@ -58,3 +61,16 @@ def test_parameter_at_its_bound_starts_again_from_typical_values():
     assert {float(start.get("lugre_load_friction.excess")) for start in starts} == {2.6}
     settled = model.replace({"lugre_load_friction.omega_s": 0.03})
     assert _away_from_bounds(settled, friction, scales) == []
+
+
+def test_a_refit_that_was_led_away_starts_from_the_model_that_it_contains():
+    """A first-order estimate may lie far beyond where it holds."""
+    stretches = whole([rig.drive_experiment(2000)])
+    segmentation = Segmentation(128, halo=4)
+    found = fit(rig.drive_model(), stretches, base_paths(rig.drive_model()), segmentation)
+    before = Trial(found.model, found, found, "zero-order")
+    lead = Lead(TorqueBias(bias=50.0), {"K": 60.0 * rig.K, "B_sp": 300.0 * rig.B_SP}, gain=1.0)
+    study = Study({"zero-order": (stretches, stretches)}, Setting(segmentation))
+    starts = [found.model.replace({"K": 61.0 * rig.K, "B_sp": 301.0 * rig.B_SP}).with_effects(lead.effect)]
+    assert first_pass(starts, study, "zero-order", champion=before).objective > found.objective
+    assert begin(before, lead, study).objective <= found.objective
