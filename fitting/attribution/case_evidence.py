@@ -5,7 +5,7 @@ Nothing here fits, simulates or decides.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -71,11 +71,13 @@ class RoundEvidence:
         asked: evidence for the leading candidate, and for better ones that the data do not support.
         behind: score difference of the chosen candidate and each refitted one, block by block.
         rivals: those that competed over whole stretches.
+        lost: gain of the chosen candidate minus that of each refitted one.
     """
 
     asked: tuple[EffectEvidence, ...]
     behind: dict[str, tuple[float, ...]]
     rivals: tuple[Rival, ...]
+    lost: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -227,6 +229,7 @@ def _round(stored: Mapping[str, Any]) -> RoundEvidence:
         tuple(EffectEvidence(**_finite(seen)) for seen in stored["asked"]),
         {name: tuple(blocks) for name, blocks in stored["behind"].items()},
         tuple(Rival(**_finite(rival)) for rival in stored["rivals"]),
+        stored.get("lost", {}),
     )
 
 

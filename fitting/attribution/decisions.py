@@ -272,7 +272,8 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
     checks: list[Check] = []
     lacking: list[str] = []
     for number, this in enumerate(evidence.rounds, start=1):
-        checks += [tie(name, np.array(behind), rules=rules) for name, behind in this.behind.items()]
+        lost = {name: this.lost.get(name, np.inf) for name in this.behind}
+        checks += [tie(name, np.array(blocks), lost[name], rules) for name, blocks in this.behind.items()]
         supported = [support(seen, rules) for seen in this.asked]
         checks += [check for those in supported for check in those]
         last = number == len(evidence.rounds)

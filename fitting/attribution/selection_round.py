@@ -122,7 +122,7 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
     found = [*refits.forms(screened), *(refits.holds(screened) if standing.excused else [])]
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    found, behind = _with_ties(found)
+    found, tied = _with_ties(found)
     rivals: tuple[Rival, ...] = ()
     known: dict[str, EffectEvidence] = {}
 
@@ -136,9 +136,9 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
         found, rivals = _simplest_first(found, before, study)
         if rivals and leader(rivals)[0].tied:
             # Others may be tied with the chosen one that are not with the best one.
-            found, behind = _with_ties(found)
+            found, tied = _with_ties(found)
         verdicts, asked, accepted = _supported_first(found, ask)
-    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
+    return Round(before, screened, tuple(verdicts), accepted, replace(tied, asked=asked, rivals=rivals))
 
 
 class _Refits:
@@ -254,18 +254,18 @@ def _reaches(trial: Trial | None, objective: float) -> bool:
     return trial is not None and trial.training.objective <= objective
 
 
-def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], dict[str, tuple[float, ...]]]:
-    """The candidates, with ties of the first one marked; and the score difference of each refitted one, block by
-    block."""
+def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
+    """The candidates, with ties of the first one marked; and the evidence for them: what each refitted one lacks of the
+    first one's score, block by block, and of its gain."""
     if not verdicts or (first := verdicts[0].trial) is None:
-        return verdicts, {}
+        return verdicts, RoundEvidence((), {}, ())
     whitening = np.asarray(first.held_out.problem.whitening)
     reference = block_scores(first, whitening)
     behind = {v.name: reference - block_scores(v.trial, whitening) for v in verdicts if v.trial is not None}
-    ties = {v.name: tie(v.name, behind[v.name], verdicts[0].gain - v.gain) for v in verdicts if v.name in behind}
-    apart = [v.name not in ties or not ties[v.name].holds for v in verdicts]
+    lost = {v.name: float(verdicts[0].gain - v.gain) for v in verdicts if v.name in behind}
+    apart = [v.name not in behind or not tie(v.name, behind[v.name], lost[v.name]).holds for v in verdicts]
     marked = [eqx.tree_at(lambda v: v.separable, v, a) for v, a in zip(verdicts, apart, strict=True)]
-    return marked, {name: tuple(map(float, blocks)) for name, blocks in behind.items()}
+    return marked, RoundEvidence((), {name: tuple(map(float, blocks)) for name, blocks in behind.items()}, (), lost)
 
 
 def _simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:

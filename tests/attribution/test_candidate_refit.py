@@ -73,4 +73,6 @@ def test_a_refit_that_was_led_away_starts_from_the_model_that_it_contains():
     study = Study({"zero-order": (stretches, stretches)}, Setting(segmentation))
     starts = [found.model.replace({"K": 61.0 * rig.K, "B_sp": 301.0 * rig.B_SP}).with_effects(lead.effect)]
     assert first_pass(starts, study, "zero-order", champion=before).objective > found.objective
-    assert begin(before, lead, study).objective <= found.objective
+    replaced = replace(before, model=rig.drive_model().with_effects(TorqueBias(bias=0.1), Backlash(b=2e-4)))
+    for sibling in (None, replaced):
+        assert begin(before, lead, study, sibling=sibling).objective <= found.objective

@@ -29,7 +29,7 @@ SEEN = EffectEvidence("friction", 1.0, 0.005)
 MODEL = ModelEvidence(-1.0, -1.0, 3, (1.0, 1.0), True)
 CHALLENGE = ChallengeEvidence(MODEL, MODEL, 1, -1.0, False)
 FINAL = FinalEvidence(("friction",), False, (1.0, 1.0), (9.0, 9.0))
-CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, ()),), CHALLENGE, FINAL)
+CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, (), {"friction": 0.3}),), CHALLENGE, FINAL)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +73,14 @@ def test_difference_below_the_least_gain_is_a_tie():
     worse = np.full(4, 9.0)
     assert tie("a", worse, 0.5 * RULES.least_gain).holds
     assert not tie("a", worse, 2.0 * RULES.least_gain).holds
+
+
+def test_replay_knows_the_gain_that_a_tied_candidate_lacks():
+    (this,) = CASE.rounds
+    for lost, holds in ((0.5 * RULES.least_gain, True), (2.0 * RULES.least_gain, False)):
+        worse = replace(this, behind={"other": (9.0,) * 9}, lost={"other": lost})
+        check = next(c for c in decide(replace(CASE, rounds=(worse,))).checks if c.about == "other")
+        assert check.holds is holds
 
 
 def test_tie_test_keeps_its_level():
