@@ -34,9 +34,12 @@ def _decision(report: Mapping[str, Any]) -> str:
     if decision == "fit_only":
         return f"The base model was fitted. On {on} data it errs by {_against_noise(before, noise, unit)}."
     if decision == "model_sufficient":
+        errs = f"on {on} data it errs by {_against_noise(before, noise, unit)}"
+        drifts = before is None or before >= RULES.excess * noise
         return (
-            f"The model suffices: on {on} data it errs by {_against_noise(before, noise, unit)}, and none of the "
+            f"The model suffices: {'over short segments it leaves only noise' if drifts else errs}, and none of the "
             f"{report['forms_tried']} tried forms of missing physics has a significant gain."
+            + (f" Free runs drift: {errs}." if drifts else "")
             + _remembering(report)
             + _noisy_torque(report)
         )

@@ -141,6 +141,15 @@ def test_unexplained_error_of_free_runs_is_reported(loop: Loop):
     assert "1.40 times what noise and uncertainty allow" in found["summary"]
 
 
+@pytest.mark.parametrize(("times", "drifts"), [(1.05, False), (24.0, True)])
+def test_summary_of_a_sufficient_model_tells_drifting_free_runs_from_noise(loop: Loop, times: float, drifts: bool):
+    report = report_dict(loop) | {"decision": "model_sufficient"}
+    report["before"]["rmse"]["test"] = times * report["noise"]["dynamic_error"]
+    said = summary(report)
+    assert ("Free runs drift: on test data it errs by" in said) is drifts
+    assert said.startswith("The model suffices: over short segments it leaves only noise, and none") is drifts
+
+
 def test_side_on_which_something_is_missing_is_told(loop: Loop):
     found = report_dict(Loop(**{**vars(loop), "decision": "unexplained", "parameters_from": "motor equation"}))
     assert "is missing on the load that the catalogue does not explain" in found["summary"]
