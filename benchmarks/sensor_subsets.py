@@ -4,19 +4,23 @@ beside this file.
 The truth is this script's own: the equations of two inertias (DESIGN 2.1) integrated by scipy, dry friction with a
 corner that its step control resolves. It shares no code with the simulator.
 
-    python benchmarks/sensor_subsets.py --draws 3 --seed 0 [--kinds NAME ...] [--only-fit]
+    python benchmarks/sensor_subsets.py --draws 3 --seed 0 [--kinds NAME ...] [--only-fit] [--out FILE]
+    python benchmarks/sensor_subsets.py --of FILE ...
 """
 
 import argparse
 import json
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from scipy.integrate import ode
+from scipy.stats import binomtest
 
 import fitting
 
@@ -219,34 +223,43 @@ def tried(kind: Kind, seed: list[int], *, only_fit: bool) -> dict:
     }
 
 
+def row(name: str, found: Sequence[Mapping[str, Any]]) -> str:
+    """A line of the table."""
+    errors = [f["error"] for f in found]
+    right = sum(f["error"] <= f.get("bound", 0.0) for f in found)
+    decided, inside = (sum(f[key] for f in found) for key in ("right", "inside"))
+    seconds = np.median([f["seconds"] for f in found])
+    figures = len(found), right, f"{np.median(errors):.1e}", f"{max(errors):.1e}", decided, inside, f"{seconds:.0f}"
+    return f"| {name} | {' | '.join(map(str, figures))} |"
+
+
 def main() -> None:
-    """Print a line a kind."""
+    """Print a line a kind, and one of all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS), metavar="KIND")
     parser.add_argument("--only-fit", action="store_true")
     parser.add_argument("--out", type=Path, help="JSON file of all draws")
+    parser.add_argument("--of", type=Path, nargs="*", default=(), help="table of the draws in these files instead")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print("| kind | draws | K right | error of K, median | worst | decision right | K in its interval | processor s |")
     print("|---|---|---|---|---|---|---|---|")
-    kept = {}
-    for name in asked.kinds:
-        place = list(KINDS).index(name)
-        found = [tried(KINDS[name], [asked.seed, place, i], only_fit=asked.only_fit) for i in range(asked.draws)]
-        errors = [f["error"] for f in found]
-        right = sum(f["error"] <= f.get("bound", 0.0) for f in found)
-        decided, inside = (sum(f[key] for f in found) for key in ("right", "inside"))
-        seconds = np.median([f["seconds"] for f in found])
-        print(
-            f"| {name} | {len(found)} | {right} | {np.median(errors):.1e} | {max(errors):.1e} | {decided} | {inside} | "
-            f"{seconds:.0f} |",
-            flush=True,
-        )
-        kept[name] = found
+    kept = {name: found for path in asked.of for name, found in json.loads(path.read_text()).items()}
+    for name in kept or asked.kinds:
+        if not asked.of:
+            place = list(KINDS).index(name)
+            kept[name] = [
+                tried(KINDS[name], [asked.seed, place, i], only_fit=asked.only_fit) for i in range(asked.draws)
+            ]
+        print(row(name, kept[name]), flush=True)
         if asked.out:
-            asked.out.write_text(json.dumps(kept, indent=1, default=str))
+            asked.out.write_text(json.dumps(kept, indent=1, default=float))
+    draws = [f for found in kept.values() for f in found]
+    print(row("all", draws))
+    low, high = binomtest(sum(f["inside"] for f in draws), len(draws)).proportion_ci()
+    print(f"\nK in its 95 % interval: exact interval {low:.1%} to {high:.1%}")
 
 
 if __name__ == "__main__":
