@@ -27,7 +27,6 @@ from fitting.attribution.support import (
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.first_order.motion import place_of
 from fitting.uncertainty.identifiability import parameters_at_bounds
-from fitting.uncertainty.one_side import corrects_scale
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
@@ -157,11 +156,7 @@ class _Refits:
         before = self.before
         worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
         swing = self.study.scales(before.training.stretches, before.model)
-        behind = [
-            lead
-            for lead in screened.leads
-            if lead.effect.imitated(before.model.drive, swing) or corrects_scale(lead.effect, self.study.side)
-        ]
+        behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
         suspects = [lead for lead in behind if lead not in worth]
         first = first_of_each_family(worth, suspects)
         self._refit(first[:1], self.study)
@@ -169,12 +164,13 @@ class _Refits:
         if leader is not None and leaves_white_noise(leader.training):
             self._beside(leader, possible_ties([*worth, *suspects], first, suspects))
             return
-        self._refit(first[1:], self.study)
+        hidden = [a for a in screened.leads if self.study.suspects(a.effect, before.model) and a not in first]
+        self._refit([*first[1:], *hidden], self.study)
         if self.done:
             best = max(self.done.values(), key=lambda trial: trial.gain_over(before))
             near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
             families = [a.effect.family for a in first if _reaches(self.done.get(a.effect.name), near)]
-            self._beside(best, further_forms([*worth, *suspects], families, first))
+            self._beside(best, further_forms([*worth, *suspects], families, [*first, *hidden]))
 
     def _refit(self, leads: Sequence[Lead], study: Study, share: float = _HOPELESS) -> None:
         begun = []

@@ -82,6 +82,16 @@ class Study:
         kind = LoadSideEffect if isinstance(side.model, MotorDrivenModel) else MotorSideEffect
         return None if any(isinstance(effect, kind) for effect in model.effects) else kind
 
+    def suspects(self, effect: Effect, model: Model) -> bool:
+        """Whether a model may lack an effect that screening does not show. Where the equation of `side` leaves only
+        noise, that is friction of the other side, or what contradicts the equation: the motion may be far off without.
+        """
+        side = self.side_of(model)
+        if side is None or any(effect.family == other.family for other in model.effects):
+            return False
+        friction = "motor_friction" if isinstance(side.model, MotorDrivenModel) else "load_friction"
+        return effect.family == friction or contradicts(effect, side)
+
     def with_substeps(self, count: int) -> "Study":
         """The same with a given number of solver steps per sample interval."""
         segmentation = replace(self.setting.segmentation, substeps=count)

@@ -33,15 +33,12 @@ def leaves_only_noise(side: Fit, found: Fit, *, most: float) -> bool:
     return any(side.principal_std < most * float(np.sqrt(variance)) for variance in noises)
 
 
-def corrects_scale(effect: Effect, side: Fit | None) -> bool:
-    """Whether an effect corrects a stated value that K and B_sp of one side's equation are in proportion to."""
-    return side is not None and isinstance(side.model, OneSideModel) and effect.corrects in side.model.scaled_by
-
-
 def contradicts(effect: Effect, side: Fit | None) -> bool:
-    """Whether K and B_sp of one side's equation are wrong where an effect is there: it corrects what they are in
-    proportion to, or what a sensor reads, since the equation is driven by the motion as it is read."""
-    return side is not None and (isinstance(effect, SensorEffect) or corrects_scale(effect, side))
+    """Whether K and B_sp of one side's equation are wrong where an effect is there: it corrects a stated value that
+    they are in proportion to, or what a sensor reads, since the equation is driven by the motion as it is read."""
+    if side is None or not isinstance(side.model, OneSideModel):
+        return False
+    return isinstance(effect, SensorEffect) or effect.corrects in side.model.scaled_by
 
 
 def with_mesh_priors(model: Model, side: Fit) -> Model:

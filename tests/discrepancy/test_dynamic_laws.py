@@ -174,7 +174,7 @@ def test_learned_law_is_read_from_its_file_unchanged(form: type[LearnedMemory], 
 def test_no_second_law_with_memory_is_screened_at_the_same_place(monkeypatch: pytest.MonkeyPatch):
     asked = []
 
-    def screen(training, held_out, *, catalogue, seed):
+    def screen(training, held_out, *, catalogue, seed, side):
         asked.extend(catalogue)
         return Screen((), np.zeros(1))
 
