@@ -116,6 +116,7 @@ class _Closed:
             after=after,
             findings=findings,
             rounds=found.rounds,
+            compared=found.compared,
             dropped=found.dropped,
             doubted=tuple(e.name for e in found.named.model.effects if e.name not in trusted),
             unknown=end.unknown,

@@ -80,6 +80,7 @@ class FitOnly(eqx.Module):
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()
     rounds: ClassVar[tuple[Round, ...]] = ()
+    compared: ClassVar[tuple[Round, ...]] = ()
     dropped: ClassVar[tuple[str, ...]] = ()
 
     @property
@@ -108,6 +109,7 @@ class Loop(eqx.Module):
         after: account of the final model; equal to `before` where nothing was found.
         findings: accepted effects, largest gain first; a learned term comes last.
         rounds: of the search.
+        compared: the rounds of the kept effects, with ties compared in the final model.
         dropped: accepted effects that a later one made superfluous.
         doubted: effects that a learned torque contradicts.
         unknown: learned term, where the catalogue does not explain all that is missing.
@@ -140,6 +142,7 @@ class Loop(eqx.Module):
     after: Account
     findings: tuple[Finding, ...]
     rounds: tuple[Round, ...]
+    compared: tuple[Round, ...]
     dropped: tuple[str, ...] = eqx.field(static=True)
     doubted: tuple[str, ...] = eqx.field(static=True)
     unknown: Unknown | None
@@ -175,4 +178,4 @@ class Loop(eqx.Module):
 def kept_rounds(outcome: Loop | FitOnly) -> list[Round]:
     """Rounds of the search whose effect is still in the final model."""
     names = {f.name for f in outcome.findings}
-    return [this for this in outcome.rounds if this.accepted and this.winner.name in names]
+    return [this for this in outcome.compared if this.accepted and this.winner.name in names]

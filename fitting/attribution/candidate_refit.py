@@ -124,12 +124,13 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
 
 
 def _with_form(model: Model, effect: Effect) -> Model:
-    """The model with an effect, which replaces the forms that it contains and takes over their strengths."""
-    for narrow in (e for e in model.effects if e.name in effect.contains):
-        for name in (n for n, info in own_parameters(narrow) if info.role == "strength"):
-            sum_of_both = getattr(effect, name) + getattr(narrow, name)
+    """The model with an effect, which takes over the strengths of those that it replaces."""
+    own = {name for name, info in own_parameters(effect) if info.role == "strength"}
+    for other in (e for e in model.effects if effect.replaces(e)):
+        for name in (n for n, info in own_parameters(other) if info.role == "strength" and n in own):
+            sum_of_both = getattr(effect, name) + getattr(other, name)
             effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, sum_of_both)
-        model = model.without_effect(narrow.name)
+        model = model.without_effect(other.name)
     return model.with_effects(effect)
 
 

@@ -11,6 +11,7 @@ from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round, look
 from fitting.attribution.study import Data, Setting, Study
 from fitting.attribution.support import Standing, leaves_imperfection
+from fitting.attribution.ties_again import decided_again
 from fitting.errors import DataError
 from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.encoder_delay import delay_of_load
@@ -34,6 +35,7 @@ class Search(eqx.Module):
         rounds: of the search.
         dropped: names of accepted effects that later ones made superfluous.
         without: the model without each of the kept effects.
+        compared: the rounds of the kept effects, with ties compared in the final model.
         noise: of the measured outputs, where it was estimated.
     """
 
@@ -42,6 +44,7 @@ class Search(eqx.Module):
     dropped: tuple[str, ...] = eqx.field(static=True)
     without: dict[str, Trial]
     noise: MeasurementNoise
+    compared: tuple[Round, ...]
 
 
 def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Study]:
@@ -87,17 +90,14 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         catalogue: candidate forms.
     """
     current, rounds, noise = base, [], measurement_noise(base.training)
-    while len(rounds) < max_effects:
-        offered, lacking = catalogue, None
+    while len(rounds) - len(_replaced(rounds)) < max_effects:
+        offered, enough = catalogue, False
         if rounds:
             enough, noise = leaves_imperfection(current, base, noise)
-            if enough:
-                lacking = study.lacking(current.model)
-                if lacking is None:
-                    break
-                offered = [form for form in catalogue if issubclass(form, lacking)]
+            if enough and not (offered := study.beside_imperfect(current.training, catalogue)):
+                break
         turn = replace(study, seed=study.seed + len(rounds))
-        this = look(Standing(current, base, noise, excused=lacking is None), turn, catalogue=offered)
+        this = look(Standing(current, base, noise, excused=not enough), turn, catalogue=offered)
         rounds.append(this)
         if not this.accepted:
             break
@@ -111,9 +111,18 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     current, superfluous, without = _without_superfluous(accepted, current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
+    compared = kept[-1:]
+    for this in reversed(kept[:-1]):
+        *_, again = found = decided_again(this, current, study)
+        compared = [*found, *compared]
+        old, new = this.winner, again.winner
+        if new.name != old.name and new.trial is not None:
+            current, without = new.trial, {}
+            rounds, dropped = [*rounds, again], [*dropped, old.name]
+            kept[kept.index(this)] = again
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
-    return Search(current, tuple(rounds), tuple(dropped), without, noise)
+    return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared))
 
 
 def _without_superfluous(
@@ -146,7 +155,7 @@ def _without_superfluous(
 
 
 def _replaced(rounds: Sequence[Round]) -> list[str]:
-    """Accepted effects that a later one contains and replaces."""
+    """Accepted effects that a later one replaces."""
     models = [(this.before.model, this.winner.trial.model) for this in rounds if this.accepted and this.winner.trial]
     return [e.name for before, after in models for e in before.effects if e.name not in {f.name for f in after.effects}]
 

@@ -94,12 +94,14 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
     assert trial is not None
     own = {verdict.name} & {e.name for e in trial.model.effects}
     errors = strength_errors(trial.training, own)
+    # A law that is replaced is not excused by its imperfection.
+    kept = [e for e in standing.before.model.effects if e.name in {other.name for other in trial.model.effects}]
     return EffectEvidence(
         name=verdict.name,
         gain=verdict.gain,
         p_value=verdict.p_value,
         removed=share_of_removed(trial, standing.before, standing.base),
-        imperfection=imperfection(standing.before) if standing.excused else 0.0,
+        imperfection=imperfection(kept) if standing.excused else 0.0,
         strength_errors=min(errors.values(), default=np.inf),
         over_noise=standing.over_noise(trial),
         at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
@@ -121,7 +123,7 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
     found = [*refits.forms(screened), *(refits.holds(screened) if standing.excused else [])]
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    found, tied = _with_ties(found)
+    found, tied = with_ties(found)
     rivals: tuple[Rival, ...] = ()
     known: dict[str, EffectEvidence] = {}
 
@@ -132,10 +134,10 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
 
     verdicts, asked, accepted = _supported_first(found, ask)
     if accepted:
-        found, rivals = _simplest_first(found, before, study)
+        found, rivals = simplest_first(found, before, study)
         if rivals and leader(rivals)[0].tied:
             # Others may be tied with the chosen one that are not with the best one.
-            found, tied = _with_ties(found)
+            found, tied = with_ties(found)
         verdicts, asked, accepted = _supported_first(found, ask)
     return Round(before, screened, tuple(verdicts), accepted, replace(tied, asked=asked, rivals=rivals))
 
@@ -250,7 +252,7 @@ def _reaches(trial: Trial | None, objective: float) -> bool:
     return trial is not None and trial.training.objective <= objective
 
 
-def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
+def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
     """The candidates, with ties of the first one marked; and the evidence for them: what each refitted one lacks of the
     first one's score, block by block, and of its gain."""
     if not verdicts or (first := verdicts[0].trial) is None:
@@ -264,7 +266,7 @@ def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
     return marked, RoundEvidence((), {name: tuple(map(float, blocks)) for name, blocks in behind.items()}, (), lost)
 
 
-def _simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:
+def simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:
     """The candidates with the chosen one of several ties first, and the evidence of the ties.
 
     Short segments hide slow errors, and leave hidden states free; so free runs along whole stretches decide.

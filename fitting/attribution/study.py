@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 
 from fitting.attribution.rules import RULES
+from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation
@@ -82,12 +83,27 @@ class Study:
         kind = LoadSideEffect if isinstance(side.model, MotorDrivenModel) else MotorSideEffect
         return None if any(isinstance(effect, kind) for effect in model.effects) else kind
 
+    def beside_imperfect(self, found: Fit, catalogue: Sequence[type[Effect]]) -> list[type[Effect]]:
+        """The forms that may improve a model although the inexact laws of its effects may explain its residual."""
+        lacking, effects = self.lacking(found.model), found.model.effects
+        another = len(effects) > 1 and not leaves_white_noise(found)
+        return [
+            form
+            for form in catalogue
+            if (lacking and issubclass(form, lacking)) or (another and any(form.replaces(e) for e in effects))
+        ]
+
     def suspects(self, effect: Effect, model: Model) -> bool:
-        """Whether a model may lack an effect that screening does not show. Where the equation of `side` leaves only
-        noise, that is friction of the other side, or what contradicts the equation: the motion may be far off without.
+        """Whether a model may lack an effect that screening does not show.
+
+        Where the equation of `side` leaves only noise, that is friction of the other side, or what contradicts the
+        equation: the motion may be far off without. Beside other effects it may also be another law of a friction,
+        whose law was chosen while they were missing.
         """
+        if any(effect.family == other.family for other in model.effects):
+            return len(model.effects) > 1 and any(effect.replaces(other) for other in model.effects)
         side = self.side_of(model)
-        if side is None or any(effect.family == other.family for other in model.effects):
+        if side is None:
             return False
         friction = "motor_friction" if isinstance(side.model, MotorDrivenModel) else "load_friction"
         return effect.family == friction or contradicts(effect, side)

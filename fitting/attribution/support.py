@@ -1,6 +1,6 @@
 """Evidence for a refitted effect: significance of its strength, removed error, plausibility of its values."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from functools import cached_property
 
 import numpy as np
@@ -64,9 +64,9 @@ def _errors_of(estimate: Estimate, part: float, effect: Effect) -> float:
     return NORMAL_95 * size / max(error, 1e-300)
 
 
-def imperfection(before: Trial) -> float:
+def imperfection(effects: Iterable[Effect]) -> float:
     """Possible rms error of the effects' laws, as a share of what they have removed."""
-    return max((effect.imperfection for effect in before.model.effects), default=0.0)
+    return max((effect.imperfection for effect in effects), default=0.0)
 
 
 def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> tuple[bool, MeasurementNoise]:
@@ -82,7 +82,7 @@ def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> 
         Whether it is so, and the noise, which is estimated with this model as well where needed: it may be smaller than
         with the base model.
     """
-    small = imperfection(before)
+    small = imperfection(before.model.effects)
     if _share(before, base, np.diag(np.asarray(noise.covariance))) > small:
         return False, noise
     noise = noise.and_beside(before.training)

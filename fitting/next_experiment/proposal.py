@@ -24,7 +24,7 @@ from fitting.estimation.weighing import whitening
 from fitting.next_experiment.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.next_experiment.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
 from fitting.next_experiment.excitation import Excitation, Limits, excitations, reached
-from fitting.outcome import FitOnly, Loop
+from fitting.outcome import FitOnly, Loop, kept_rounds
 from fitting.progress import Progress, silent
 from fitting.uncertainty.normal_law import NORMAL_95
 from hdjax import Hold, Model, TwoInertiaModel, sampled
@@ -121,8 +121,7 @@ def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
     names = {f.name for f in loop.findings}
     pairs = [
         (this.winner, verdict)
-        for this in loop.rounds
-        if this.accepted and this.winner.name in names
+        for this in kept_rounds(loop)
         for verdict in this.verdicts
         if verdict.trial is not None and not verdict.separable and verdict.name not in names
     ]

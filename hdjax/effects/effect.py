@@ -10,6 +10,9 @@ from jaxtyping import Array, Float
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.signals import PiecewisePolynomial
 
+_ONE_LAW = frozenset(("motor_friction", "load_friction"))
+"""Families of which a model has one form: a shaft has one law of friction."""
+
 _ANGLES = frozenset(("theta_m", "theta_l"))
 
 
@@ -124,8 +127,7 @@ class Effect(eqx.Module):
             suitable.
         one_shape_of: the quantity that it is a specific function of; another function would be another effect.
         corrects: the parameter of the drive whose stated value it corrects.
-        contains: names of the forms that it contains, with the same symbols: it replaces them and takes over their
-            strengths.
+        contains: names of the forms that it contains, with the same symbols.
         imperfection: possible rms error of its law, as a share of the error that it removes: no form is exact.
     """
 
@@ -162,6 +164,12 @@ class Effect(eqx.Module):
         Further starting points of a fit, far from the first-order estimate; none where the drive is plausible.
         """
         return ()
+
+    @classmethod
+    def replaces(cls, other: "Effect") -> bool:
+        """Whether it takes the place of another effect of a model: of a form that it contains, or of another law of the
+        same friction."""
+        return other.name in cls.contains or (cls.family in _ONE_LAW and other.family == cls.family)
 
     @property
     def needs_temperature(self) -> bool:

@@ -1,0 +1,56 @@
+"""Rivals of earlier rounds, compared again beside all effects of the model.
+
+A round chooses a form while later effects are still missing. Beside these the data may tell it from its ties, or a
+simpler form of its family may suffice.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+
+from fitting.attribution.candidate_fit import Trial, challenge
+from fitting.attribution.case_evidence import RoundEvidence
+from fitting.attribution.selection_round import Round, Verdict, simplest_first, with_ties
+from fitting.attribution.study import Study
+
+
+def decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ...]:
+    """A round without its ties and the other forms of its family, and the comparison of these with its effect in the
+    final model, the chosen one first; the round alone where it has none.
+
+    Args:
+        this: an accepted round.
+        current: the final model.
+        study: the data and their segmentation.
+    """
+    winner, *others = this.verdicts
+    present = {e.name for e in current.model.effects}
+    rivals = [
+        v
+        for v in others
+        if v.trial is not None and v.name not in present and (v.family == winner.family or not v.separable)
+    ]
+    if not rivals:
+        return (this,)
+    study.progress(f"refitting with rivals of {winner.name}")
+    study = study.with_substeps(current.training.substeps)
+    tried = [replace(winner, trial=current), *(_instead_of(winner, v, current, study) for v in rivals)]
+    tried, _ = with_ties([v for v in tried if v.trial is not None])
+    tried, _ = simplest_first(tried, this.before, study)
+    first, *rest = tried
+    apart = [v for v in others if v not in rivals]
+    again = Round(this.before, this.screen, (replace(first, separable=True), *rest), True, RoundEvidence((), {}, ()))
+    return eqx.tree_at(lambda r: r.verdicts, this, (winner, *apart)), again
+
+
+def _instead_of(winner: Verdict, other: Verdict, current: Trial, study: Study) -> Verdict:
+    """The result of another form in the place of a round's effect in the final model; without a trial where it explains
+    less."""
+    assert other.trial is not None
+    theirs = [e for e in other.trial.model.effects if e.name == other.name]
+    if not theirs or winner.name not in {e.name for e in current.model.effects}:
+        return replace(other, trial=None)
+    model = current.model.without_effect(winner.name).with_effects(*theirs)
+    trial = challenge([model], study, current.hold, champion=current)
+    lost = 0.0 if trial is None else trial.held_out.objective - current.held_out.objective
+    return replace(other, trial=trial, gain=winner.gain - lost)
