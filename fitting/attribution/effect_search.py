@@ -7,11 +7,11 @@ import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, attempt, continued, halo_for
+from fitting.attribution.rivals_again import compare_again
 from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round, look
 from fitting.attribution.study import Data, Setting, Study
 from fitting.attribution.support import Standing, leaves_imperfection
-from fitting.attribution.ties_again import decided_again
 from fitting.errors import DataError
 from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.encoder_delay import delay_of_load
@@ -111,15 +111,9 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     current, superfluous, without = _without_superfluous(accepted, current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
-    compared = kept[-1:]
-    for this in reversed(kept[:-1]):
-        *_, again = found = decided_again(this, current, study)
-        compared = [*found, *compared]
-        old, new = this.winner, again.winner
-        if new.name != old.name and new.trial is not None:
-            current, without = new.trial, {}
-            rounds, dropped = [*rounds, again], [*dropped, old.name]
-            kept[kept.index(this)] = again
+    current, compared, instead = compare_again(kept, current, study)
+    rounds, dropped, without = [*rounds, *instead.values()], [*dropped, *instead], {} if instead else without
+    kept = [instead[name] if (name := this.winner.name) in instead else this for this in kept]
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared))

@@ -4,6 +4,7 @@ A round chooses a form while later effects are still missing. Beside these the d
 simpler form of its family may suffice.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,13 +15,32 @@ from fitting.attribution.selection_round import Round, Verdict, simplest_first, 
 from fitting.attribution.study import Study
 
 
-def decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ...]:
+def compare_again(kept: Sequence[Round], current: Trial, study: Study) -> tuple[Trial, list[Round], dict[str, Round]]:
+    """The model with the chosen forms, the rounds with their rivals compared in it, and those of them that replace a
+    round's effect, by its name.
+
+    Args:
+        kept: the rounds of the model's effects.
+        current: the model.
+        study: the data and their segmentation.
+    """
+    compared, instead = {}, {}
+    # All other effects were there in the last round, unless one is replaced now.
+    for this in [*reversed(kept[:-1]), *kept[-1:]]:
+        found = _decided_again(this, current, study) if this is not kept[-1] or instead else (this,)
+        compared[this.winner.name], chosen = found, found[-1].winner
+        if chosen.name != this.winner.name and chosen.trial is not None:
+            current, instead[this.winner.name] = chosen.trial, found[-1]
+    return current, [one for this in kept for one in compared[this.winner.name]], instead
+
+
+def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ...]:
     """A round without its ties and the other forms of its family, and the comparison of these with its effect in the
     final model, the chosen one first; the round alone where it has none.
 
     Args:
         this: an accepted round.
-        current: the final model.
+        current: the model.
         study: the data and their segmentation.
     """
     winner, *others = this.verdicts
