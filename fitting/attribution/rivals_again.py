@@ -55,10 +55,11 @@ def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ..
     study.progress(f"refitting with rivals of {winner.name}")
     study = study.with_substeps(current.training.substeps)
     tried = [replace(winner, trial=current), *(_instead_of(winner, v, current, study) for v in rivals)]
-    tried, _ = with_ties([v for v in tried if v.trial is not None])
+    tried, _ = with_ties(sorted((v for v in tried if v.trial is not None), key=lambda v: -v.gain))
     tried, _ = simplest_first(tried, this.before, study)
-    first, *rest = tried
-    apart = [v for v in others if v not in rivals]
+    (first, *rest), _ = with_ties(tried)
+    names = {v.name for v in rivals}
+    apart = [v for v in others if v.name not in names]
     again = Round(this.before, this.screen, (replace(first, separable=True), *rest), True, RoundEvidence((), {}, ()))
     return eqx.tree_at(lambda r: r.verdicts, this, (winner, *apart)), again
 
