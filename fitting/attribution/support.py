@@ -150,27 +150,24 @@ class Standing:
 
 
 def share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:
-    """Error that a further effect removes on selection data, over that removed by preceding effects (rms), of the
+    """Error that a further effect removes on selection data, over the influence of preceding effects (rms), of the
     output where it is largest; infinite for the first effect.
 
     The error of an inexact law is a share of its influence on each output. Friction may move the motor by thousands of
     times the encoder's noise, and the twist only a little.
     """
-    return _share(before, base, _mean_squares(trial))
+    return _share(before, base, np.diag(np.asarray(trial.held_out.covariance)))
 
 
 def _share(before: Trial, base: Trial, left: Float[np.ndarray, " outputs"]) -> float:
     """The ratio for given remaining mean squares, as in [`share_of_removed`][]."""
-    then, first = _mean_squares(before), _mean_squares(base)
-    better = first > then
-    if before is base or not np.any(better):
+    if before is base:
         return np.inf
-    return float(np.sqrt(np.max(np.maximum(then - left, 0.0)[better] / (first - then)[better])))
-
-
-def _mean_squares(trial: Trial) -> Float[np.ndarray, " outputs"]:
-    """Mean square of each output's error on selection data."""
-    return np.diag(np.asarray(trial.held_out.covariance))
+    weight = np.asarray(before.held_out.problem.segments.weight)[..., None]
+    moved = np.where(weight > 0, np.asarray(before.held_out.error) - np.asarray(base.held_out.error), 0.0)
+    influence = np.sum(weight * moved**2, axis=(0, 1)) / np.sum(weight)
+    then = np.diag(np.asarray(before.held_out.covariance))
+    return float(np.sqrt(np.max(np.maximum(then - left, 0.0) / np.maximum(influence, 1e-300))))
 
 
 def is_plausible(trial: Trial, name: str) -> bool:
