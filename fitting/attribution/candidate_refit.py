@@ -18,6 +18,8 @@ from hdjax.parameters import as_scalar, own_parameters
 
 # Iterations after which another hold of the torque must explain more: it changes the motion so little that few suffice.
 _HOLD_STEPS = Strategy(3, reweigh=False, begin_anew_above=np.inf, retry_states=False)
+# A shape that is so much smaller than a typical one has no influence, and no slope leads back.
+_VANISHED = 1e-6
 
 
 def try_lead(before: Trial, lead: Lead, study: Study, give_up_above: float) -> Trial | None:
@@ -87,7 +89,7 @@ def complete_refit(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_
     trial = completed(begun, study, before.hold, champion=before, give_up_above=give_up_above)
     if trial is None:
         return None
-    starts = _away_from_bounds(trial.model, lead.effect, study.scales(before.training.stretches, before.model))
+    starts = _unstuck(trial.model, study.scales(before.training.stretches, before.model))
     if starts:
         near = [trial.training] * len(starts)
         again = first_pass(starts, study, before.hold, near=near, champion=before)
@@ -95,16 +97,21 @@ def complete_refit(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_
     return replace(trial, lasting=lasting_share(lead.effect, before, trial))
 
 
-def _away_from_bounds(model: Model, effect: Effect, scales: Scales) -> list[Model]:
-    """The model with the effect's parameters that ended at a bound at the values of its proposals, the others as they
-    are; none where it ended at no bound. A shape that grows without limit ends in a simpler law, far from the optimum.
+def _unstuck(model: Model, scales: Scales) -> list[Model]:
+    """For each effect of which a parameter ended at a bound, or a shape has vanished, the model with these at the
+    values of its proposals, and the others as they are. A shape without limit ends in a simpler law, far from the
+    optimum.
     """
-    names = [path.removeprefix(f"{effect.name}.") for path in parameters_at_bounds(model, effect.name)]
     found = {}
-    for proposal in type(effect).proposals(scales) if names else ():
-        values = {f"{effect.name}.{name}": float(getattr(proposal, name)) for name in names}
-        if all(values.values()):
-            found[tuple(values.values())] = model.replace(values)
+    for effect in model.effects:
+        names = {path.removeprefix(f"{effect.name}.") for path in parameters_at_bounds(model, effect.name)}
+        shapes = [name for name, info in own_parameters(effect) if info.role == "shape" and info.positive]
+        for proposal in type(effect).proposals(scales) if names or shapes else ():
+            typical = {name: float(getattr(proposal, name)) for name in {*names, *shapes}}
+            vanished = {n for n in shapes if 0.0 < float(getattr(effect, n)) < _VANISHED * typical[n]}
+            values = {f"{effect.name}.{n}": typical[n] for n in names | vanished}
+            if values and all(values.values()):
+                found[tuple(values.items())] = model.replace(values)
     return list(found.values())
 
 

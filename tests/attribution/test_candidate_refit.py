@@ -6,7 +6,7 @@ import pytest
 
 import rig
 from fitting.attribution.candidate_fit import Trial, first_pass
-from fitting.attribution.candidate_refit import _as_sibling, _away_from_bounds, begin
+from fitting.attribution.candidate_refit import _as_sibling, _unstuck, begin
 from fitting.attribution.screening import Lead
 from fitting.attribution.selection_round import _are_siblings
 from fitting.attribution.study import Setting, Study
@@ -55,12 +55,23 @@ def test_parameter_at_its_bound_starts_again_from_typical_values():
     scales = Scales(x=2e-4, x_max=1e-3, v=0.03, omega_m=15.0, omega_l=0.15, time_step=1e-3, omega_0=400.0)
     friction = LuGreLoadFriction(T_c=0.5, excess=2.6, omega_s=2e13, bend=9e-5, tau=7e-4, settling=2e-4)
     model = rig.drive_model().with_effects(friction)
-    starts = _away_from_bounds(model, friction, scales)
+    starts = _unstuck(model, scales)
     rates = [float(start.get("lugre_load_friction.omega_s")) for start in starts]
     assert sorted(rates) == sorted({float(p.omega_s) for p in LuGreLoadFriction.proposals(scales)})
     assert {float(start.get("lugre_load_friction.excess")) for start in starts} == {2.6}
     settled = model.replace({"lugre_load_friction.omega_s": 0.03})
-    assert _away_from_bounds(settled, friction, scales) == []
+    assert _unstuck(settled, scales) == []
+
+
+def test_shape_that_vanished_starts_again_beside_any_candidate():
+    """The corner of dry friction may be sharp while a later effect is missing."""
+    scales = Scales(x=2e-4, x_max=1e-3, v=0.03, omega_m=15.0, omega_l=0.15, time_step=1e-3, omega_0=400.0)
+    model = rig.drive_model().with_effects(MotorFriction(T_c=0.1, transition=1e-28), TorqueBias(bias=0.1))
+    (start,) = _unstuck(model, scales)
+    (typical,) = MotorFriction.proposals(scales)
+    assert float(start.get("motor_friction.transition")) == float(typical.transition)
+    assert float(start.get("motor_friction.T_c")) == 0.1 and float(start.get("torque_bias.bias")) == 0.1
+    assert _unstuck(model.replace({"motor_friction.transition": 1e-3}), scales) == []
 
 
 def test_a_refit_that_was_led_away_starts_from_the_model_that_it_contains():
