@@ -117,7 +117,7 @@ def test_free_runs_decide_between_tied_candidates(
         return None if None in gains else gains
 
     monkeypatch.setattr(attribution, "long_gains", long_gains)
-    ordered, _ = attribution._simplest_first(tied, before, STUDY)
+    ordered, _ = attribution.simplest_first(tied, before, STUDY)
     assert ordered[0].name == leader
 
 
@@ -137,7 +137,7 @@ def test_form_with_memory_leads_only_with_a_gain_over_whole_stretches(
     ]
     long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
     monkeypatch.setattr(attribution, "long_gains", lambda before, trials, study: [long[id(t)] for t in trials])
-    (first, second), rivals = attribution._simplest_first(ordered, before, STUDY)
+    (first, second), rivals = attribution.simplest_first(ordered, before, STUDY)
     assert {r.name: r.long_gain for r in rivals} == {"torque_bias": 2.0, "creep": creep_long}
     assert (first.name, first.separable, second.separable) == (leader, False, True)
 
@@ -153,7 +153,7 @@ def test_form_without_memory_is_preferred_at_equal_parameter_count(verdicts, mon
 
     dahl, dry = DahlMotorFriction(T_c=0.1, bend=0.1, settling=1e-3), MotorFriction(T_c=0.1, transition=0.1)
     assert len(effect_paths(dahl)) == len(effect_paths(dry))
-    ordered, _ = attribution._simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, STUDY)
+    ordered, _ = attribution.simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, STUDY)
     assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 
@@ -171,23 +171,32 @@ def test_ties_are_those_of_the_first_candidate(verdicts, monkeypatch: pytest.Mon
     candidates = [Verdict(n, "family", t, t.lasting, 0.001, True) for n, t in zip(names, trials, strict=True)]
 
     def tied(order: list[Verdict]) -> list[str]:
-        return [v.name for v in attribution._with_ties(order)[0] if not v.separable]
+        return [v.name for v in attribution.with_ties(order)[0] if not v.separable]
 
     best, chosen, third = candidates
     assert tied([best, chosen, third]) == ["best", "chosen"]
     assert tied([chosen, best, third]) == ["chosen", "best", "third"]
 
 
+def with_error(trial: Trial, rms: float, *, by_effects: float = 0.0) -> Trial:
+    """A trial with given errors on selection data: what other effects would remove, and what is orthogonal to that."""
+    turns = np.cumsum(np.ones_like(np.asarray(trial.held_out.error)), axis=1) % 2 * 2.0 - 1.0
+    return eqx.tree_at(
+        lambda t: (t.held_out.covariance, t.held_out.error),
+        trial,
+        (jnp.asarray([[rms**2 + by_effects**2]]), jnp.asarray(by_effects + rms * turns)),
+    )
+
+
 def test_removed_share_is_relative_to_earlier_effects(verdicts):
-    """With errors of 1000 and 1 in units of the noise, the last unit is 1e-3 of what was removed before."""
+    """With errors of 1000 and 1 in units of the noise, the last unit is 1e-3 of the influence of earlier effects; where
+    these leave as much, since another effect hides theirs, that is no excuse."""
     trial, _ = verdicts
-
-    def with_error(rms: float) -> Trial:
-        return eqx.tree_at(lambda t: t.held_out.covariance, trial, jnp.asarray([[1.0 + rms**2]]))
-
-    base, before, after = with_error(1000.0), with_error(1.0), with_error(0.0)
+    base, before, after = with_error(trial, 1.0, by_effects=1000.0), with_error(trial, 1.0), with_error(trial, 0.0)
     assert support.share_of_removed(after, before, base) == pytest.approx(1e-3, rel=1e-3)
     assert support.share_of_removed(after, base, base) == np.inf
+    hidden = with_error(trial, 1000.0, by_effects=30.0), with_error(trial, 1000.1)
+    assert support.share_of_removed(after, hidden[1], hidden[0]) == pytest.approx(1000.0 / 30.0, rel=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -212,16 +221,14 @@ def test_search_ends_when_only_imperfection_of_effects_is_left(
 ):
     trial, _ = verdicts
 
-    def with_error(rms: float, *effects: Effect) -> Trial:
-        parts = (rig.drive_model().with_effects(*effects), jnp.asarray([[rms**2]]))
-        return eqx.tree_at(lambda t: (t.model, t.held_out.covariance), trial, parts)
-
     def seen_as(rms: float) -> MeasurementNoise:
         return MeasurementNoise(jnp.asarray([[rms**2]]), ())
 
     monkeypatch.setattr(MeasurementNoise, "and_beside", lambda self, fit: seen_as(noise))
-    base, by_base = with_error(1000.0), seen_as(5.0)
-    before = base if effect is None else with_error(left, effect)
+    base, by_base = with_error(trial, left, by_effects=1000.0), seen_as(5.0)
+    before = base
+    if effect is not None:
+        before = eqx.tree_at(lambda t: t.model, with_error(trial, left), rig.drive_model().with_effects(effect))
     found, seen = support.leaves_imperfection(before, base, by_base)
     assert found == is_all
     assert (seen is not by_base) == asked

@@ -114,7 +114,7 @@ def test_tie_is_reported_with_the_separating_experiment(loop: Loop):
     winner = loop.rounds[0].winner
     tied = Verdict("torque_bias", "torque_sensor", winner.trial, winner.gain, winner.p_value, separable=False)
     apart = Verdict("other", "motor_friction", winner.trial, winner.gain, winner.p_value, separable=True)
-    told = eqx.tree_at(lambda x: x.rounds[0].verdicts, loop, (winner, tied, apart))
+    told = eqx.tree_at(lambda x: x.compared[0].verdicts, loop, (winner, tied, apart))
     found = report_dict(told)
     (other,) = found["alternatives"]
     assert (other["family"], other["separable"]) == ("torque_sensor", False)
@@ -286,7 +286,7 @@ def test_intervals_include_tied_forms_of_the_same_family(loop: Loop, family: str
     assert trial is not None and first.accepted and first.winner.family == "motor_friction"
     stiffer = eqx.tree_at(lambda t: t.model, trial, trial.model.replace({"K": trial.model.get("K") + 5.0}))
     rival = Verdict("stribeck_motor_friction", family, stiffer, first.winner.gain, 0.001, False)
-    tied = eqx.tree_at(lambda o: o.rounds, loop, (dataclasses.replace(first, verdicts=(*first.verdicts, rival)),))
+    tied = eqx.tree_at(lambda o: o.compared, loop, (dataclasses.replace(first, verdicts=(*first.verdicts, rival)),))
     one, both = (report_dict(o)["after"] for o in (loop, tied))
     low, high = one["parameters"]["K"]["ci95"]
     assert both["parameters"]["K"]["ci95"] == pytest.approx([low, high + moved])
