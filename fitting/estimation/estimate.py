@@ -324,8 +324,9 @@ def _growing(problem: Problem, length: int) -> list[int]:
 
 def half_log_determinant(covariance: Array | np.ndarray) -> float:
     """The objective of errors with this covariance; infinite where it is not positive definite."""
-    sign, value = np.linalg.slogdet(np.asarray(covariance))
-    return float(0.5 * value) if sign > 0 else np.inf
+    with np.errstate(all="ignore"):
+        sign, value = np.linalg.slogdet(np.asarray(covariance))
+    return float(0.5 * value) if sign > 0 and np.isfinite(value) else np.inf
 
 
 def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:

@@ -149,7 +149,8 @@ def without_gaps(found: Fit) -> Fit:
     outputs = np.asarray(simulate(problem, Unknowns(values, states))[0])
     segments = problem.segments
     error = (np.asarray(segments.measured) - outputs)[np.asarray(segments.weight) > 0]
-    covariance = error.T @ error / len(error)
+    with np.errstate(all="ignore"):  # the simulation may diverge
+        covariance = error.T @ error / len(error)
     return replace(found, covariance=jnp.asarray(covariance), objective=half_log_determinant(covariance))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimation.estimate import Fit, Start, Strategy, fit, lost
+from fitting.estimation.estimate import Fit, Start, Strategy, fit, half_log_determinant, lost
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
@@ -216,3 +216,10 @@ def test_diverged_segments_are_detected(found: Fit):
     error[1, 5, 0] = np.nan
     error[2, 7, 1] = 1e7 * found.principal_std
     assert np.flatnonzero(lost(replace(found, error=jnp.asarray(error)))).tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "covariance", [np.diag([1.0, np.nan]), np.full((2, 2), np.inf), np.ones((2, 2)), np.zeros((1, 1))]
+)
+def test_objective_of_a_simulation_that_diverged_is_infinite(covariance: np.ndarray):
+    assert half_log_determinant(covariance) == np.inf
