@@ -10,7 +10,7 @@ from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import NoiseEvidence
 from fitting.attribution.decisions import only_noise
 from fitting.attribution.rules import RULES, DecisionRules
-from fitting.estimation.estimate import Fit
+from fitting.estimation.estimate import Fit, lost
 from fitting.estimation.free_parameters import effect_paths, strength_paths
 from fitting.uncertainty.measurement_noise import MeasurementNoise
 from fitting.uncertainty.noise_model import NoiseModel, noise_model
@@ -163,9 +163,11 @@ def _share(before: Trial, base: Trial, left: Float[np.ndarray, " outputs"]) -> f
     """The ratio for given remaining mean squares, as in [`share_of_removed`][]."""
     if before is base:
         return np.inf
-    weight = np.asarray(before.held_out.problem.segments.weight)[..., None]
-    moved = np.where(weight > 0, np.asarray(before.held_out.error) - np.asarray(base.held_out.error), 0.0)
-    influence = np.sum(weight * moved**2, axis=(0, 1)) / np.sum(weight)
+    fits = before.held_out, base.held_out
+    followed = ~np.any([lost(fit) for fit in fits], axis=0)
+    weight = np.asarray(before.held_out.problem.segments.weight)[followed, :, None]
+    one, other = (np.where(weight > 0, np.asarray(fit.error)[followed], 0.0) for fit in fits)
+    influence = np.sum(weight * (one - other) ** 2, axis=(0, 1)) / max(float(np.sum(weight)), 1.0)
     then = np.diag(np.asarray(before.held_out.covariance))
     return float(np.sqrt(np.max(np.maximum(then - left, 0.0) / np.maximum(influence, 1e-300))))
 

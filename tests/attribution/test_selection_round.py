@@ -179,12 +179,12 @@ def test_ties_are_those_of_the_first_candidate(verdicts, monkeypatch: pytest.Mon
 
 
 def with_error(trial: Trial, rms: float, *, by_effects: float = 0.0) -> Trial:
-    """A trial with given errors on selection data: what other effects would remove, and what is orthogonal to that."""
+    """A trial with given errors on selection data [urad]: what other effects remove, and what is orthogonal to that."""
     turns = np.cumsum(np.ones_like(np.asarray(trial.held_out.error)), axis=1) % 2 * 2.0 - 1.0
     return eqx.tree_at(
         lambda t: (t.held_out.covariance, t.held_out.error),
         trial,
-        (jnp.asarray([[rms**2 + by_effects**2]]), jnp.asarray(by_effects + rms * turns)),
+        (jnp.asarray([[1e-12 * (rms**2 + by_effects**2)]]), jnp.asarray(1e-6 * (by_effects + rms * turns))),
     )
 
 
@@ -222,7 +222,7 @@ def test_search_ends_when_only_imperfection_of_effects_is_left(
     trial, _ = verdicts
 
     def seen_as(rms: float) -> MeasurementNoise:
-        return MeasurementNoise(jnp.asarray([[rms**2]]), ())
+        return MeasurementNoise(jnp.asarray([[1e-12 * rms**2]]), ())
 
     monkeypatch.setattr(MeasurementNoise, "and_beside", lambda self, fit: seen_as(noise))
     base, by_base = with_error(trial, left, by_effects=1000.0), seen_as(5.0)
