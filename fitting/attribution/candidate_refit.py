@@ -18,7 +18,8 @@ from hdjax.parameters import as_scalar, own_parameters
 
 # Iterations after which another hold of the torque must explain more: it changes the motion so little that few suffice.
 _HOLD_STEPS = Strategy(3, reweigh=False, begin_anew_above=np.inf, retry_states=False)
-# A shape that is so much smaller than a typical one has no influence, and no slope leads back.
+# A shape that is so much smaller than a typical one has no influence, and no slope leads back. Assumed: it decides only
+# whether one more start is tried.
 _VANISHED = 1e-6
 
 

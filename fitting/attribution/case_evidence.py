@@ -74,9 +74,9 @@ class RoundEvidence:
         lost: gain of the chosen candidate minus that of each refitted one.
     """
 
-    asked: tuple[EffectEvidence, ...]
-    behind: dict[str, tuple[float, ...]]
-    rivals: tuple[Rival, ...]
+    asked: tuple[EffectEvidence, ...] = ()
+    behind: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    rivals: tuple[Rival, ...] = ()
     lost: dict[str, float] = field(default_factory=dict)
 
 

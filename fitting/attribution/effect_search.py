@@ -112,8 +112,9 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
     current, compared, instead = compare_again(kept, current, study)
-    rounds, dropped, without = [*rounds, *instead.values()], [*dropped, *instead], {} if instead else without
-    kept = [instead[name] if (name := this.winner.name) in instead else this for this in kept]
+    if instead:
+        rounds, dropped, without = [*rounds, *instead.values()], [*dropped, *instead], {}
+        kept = [instead[name] if (name := this.winner.name) in instead else this for this in kept]
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared))

@@ -60,7 +60,7 @@ def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ..
     (first, *rest), _ = with_ties(tried)
     names = {v.name for v in rivals}
     apart = [v for v in others if v.name not in names]
-    again = Round(this.before, this.screen, (replace(first, separable=True), *rest), True, RoundEvidence((), {}, ()))
+    again = Round(this.before, this.screen, (replace(first, separable=True), *rest), True, RoundEvidence())
     return eqx.tree_at(lambda r: r.verdicts, this, (winner, *apart)), again
 
 

@@ -104,11 +104,13 @@ def screen(
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
     known = len(free_now)
+    off, slope = _priors(training)
+    free_mesh = np.where([path in MESH for path in training.free.paths], 0.0, slope)
     for effect, own, states, (fitted, unseen) in _responses(training, held_out, proposals, seed, strays=strays):
         used = [*range(known), *(skipped + known + c for c in own)]
         fitted, unseen = fitted.columns(used), unseen.columns(used)
         if known:
-            fitted = fitted.beside_prior(*_priors(training, without_mesh=contradicts(effect, side)))
+            fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
         if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
             # Its response diverges along this motion: nothing is known to first order.
             continue
@@ -128,12 +130,11 @@ def screen(
     return Screen(tuple(ordered), chance)
 
 
-def _priors(fit: Fit, *, without_mesh: bool) -> tuple[np.ndarray, np.ndarray]:
+def _priors(fit: Fit) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, " free"]]:
     """Deviation of each free parameter from its prior mean, in standard deviations, and its derivative by the
-    parameter; without those of K, alpha and B_sp if asked."""
+    parameter."""
     free = fit.free
-    held = [not (without_mesh and path in MESH) for path in free.paths]
-    slope = np.asarray(free.precision) / np.asarray(free.slopes(fit.model)) * held
+    slope = np.asarray(free.precision) / np.asarray(free.slopes(fit.model))
     return np.asarray(free.off_prior(free.pack(fit.model))), slope
 
 

@@ -80,7 +80,7 @@ class Round(eqx.Module, Generic[Fitted, Refitted]):
     screen: Screen[Any]
     verdicts: tuple[Verdict[Refitted], ...]
     accepted: bool
-    evidence: RoundEvidence = eqx.field(static=True, default=RoundEvidence((), {}, ()))
+    evidence: RoundEvidence = eqx.field(static=True, default=RoundEvidence())
 
     @property
     def winner(self) -> Verdict[Refitted]:
@@ -256,14 +256,14 @@ def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
     """The candidates, with ties of the first one marked; and the evidence for them: what each refitted one lacks of the
     first one's score, block by block, and of its gain."""
     if not verdicts or (first := verdicts[0].trial) is None:
-        return verdicts, RoundEvidence((), {}, ())
+        return verdicts, RoundEvidence()
     whitening = np.asarray(first.held_out.problem.whitening)
     reference = block_scores(first, whitening)
     behind = {v.name: reference - block_scores(v.trial, whitening) for v in verdicts if v.trial is not None}
     lost = {v.name: float(verdicts[0].gain - v.gain) for v in verdicts if v.name in behind}
     apart = [v.name not in behind or not tie(v.name, behind[v.name], lost[v.name]).holds for v in verdicts]
     marked = [eqx.tree_at(lambda v: v.separable, v, a) for v, a in zip(verdicts, apart, strict=True)]
-    return marked, RoundEvidence((), {name: tuple(map(float, blocks)) for name, blocks in behind.items()}, (), lost)
+    return marked, RoundEvidence(behind={n: tuple(map(float, blocks)) for n, blocks in behind.items()}, lost=lost)
 
 
 def simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:

@@ -85,12 +85,11 @@ class Study:
 
     def beside_imperfect(self, found: Fit, catalogue: Sequence[type[Effect]]) -> list[type[Effect]]:
         """The forms that may improve a model although the inexact laws of its effects may explain its residual."""
-        lacking, effects = self.lacking(found.model), found.model.effects
-        another = len(effects) > 1 and not leaves_white_noise(found)
+        lacking, another = self.lacking(found.model), not leaves_white_noise(found)
         return [
             form
             for form in catalogue
-            if (lacking and issubclass(form, lacking)) or (another and any(form.replaces(e) for e in effects))
+            if (lacking and issubclass(form, lacking)) or (another and _is_another_law(form, found.model))
         ]
 
     def suspects(self, effect: Effect, model: Model) -> bool:
@@ -101,7 +100,7 @@ class Study:
         whose law was chosen while they were missing.
         """
         if any(effect.family == other.family for other in model.effects):
-            return len(model.effects) > 1 and any(effect.replaces(other) for other in model.effects)
+            return _is_another_law(effect, model)
         side = self.side_of(model)
         if side is None:
             return False
@@ -122,3 +121,8 @@ class Study:
         """The same with as many solver steps as the fitted motion needs."""
         substeps = needed_substeps(found)
         return self.with_substeps(substeps) if substeps > (self.setting.segmentation.substeps or 0) else self
+
+
+def _is_another_law(effect: Effect | type[Effect], model: Model) -> bool:
+    """Whether an effect is another law of one that was chosen before others of the model were there."""
+    return len(model.effects) > 1 and any(effect.replaces(other) for other in model.effects)

@@ -144,7 +144,7 @@ def look(
         winner, share = verdicts[0], _share_of_removed(held, verdicts[0].trial, before, base)
         asked = [_evidence(winner.trial.beyond(before), winner.gain, winner.p_value, share)]
         accepted = _is_supported(asked[0])
-    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(tuple(asked), {}, ()))
+    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(tuple(asked)))
 
 
 def _refit(held: Held, before: TwistTrial, lead: Lead, screened: Screen[Lead]) -> TwistVerdict:
