@@ -13,6 +13,7 @@ from fitting.attribution.candidate_fit import Trial, challenge
 from fitting.attribution.case_evidence import RoundEvidence
 from fitting.attribution.selection_round import Round, Verdict, simplest_first, with_ties
 from fitting.attribution.study import Study
+from hdjax.effects import Effect
 
 
 def compare_again(kept: Sequence[Round], current: Trial, study: Study) -> tuple[Trial, list[Round], dict[str, Round]]:
@@ -36,7 +37,7 @@ def compare_again(kept: Sequence[Round], current: Trial, study: Study) -> tuple[
 
 def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ...]:
     """A round without its ties and the other forms of its family, and the comparison of these with its effect in the
-    final model, the chosen one first; the round alone where it has none.
+    final model, the chosen one first; the round alone where it has none, or is about a hold. Holds stay where they are.
 
     Args:
         this: an accepted round.
@@ -46,32 +47,30 @@ def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ..
     winner, *others = this.verdicts
     present = {e.name for e in current.model.effects}
     rivals = [
-        v
+        (v, effect)
         for v in others
         if v.trial is not None and v.name not in present and (v.family == winner.family or not v.separable)
+        for effect in v.trial.model.effects
+        if effect.name == v.name
     ]
-    if not rivals:
+    if winner.name not in present or not rivals:
         return (this,)
     study.progress(f"refitting with rivals of {winner.name}")
     study = study.with_substeps(current.training.substeps)
-    tried = [replace(winner, trial=current), *(_instead_of(winner, v, current, study) for v in rivals)]
+    tried = [replace(winner, trial=current), *(_instead_of(winner, *rival, current, study) for rival in rivals)]
     tried, _ = with_ties(sorted((v for v in tried if v.trial is not None), key=lambda v: -v.gain))
     tried, _ = simplest_first(tried, this.before, study)
     (first, *rest), _ = with_ties(tried)
-    names = {v.name for v in rivals}
+    names = {v.name for v, _ in rivals}
     apart = [v for v in others if v.name not in names]
     again = Round(this.before, this.screen, (replace(first, separable=True), *rest), True, RoundEvidence())
     return eqx.tree_at(lambda r: r.verdicts, this, (winner, *apart)), again
 
 
-def _instead_of(winner: Verdict, other: Verdict, current: Trial, study: Study) -> Verdict:
+def _instead_of(winner: Verdict, other: Verdict, effect: Effect, current: Trial, study: Study) -> Verdict:
     """The result of another form in the place of a round's effect in the final model; without a trial where it explains
     less."""
-    assert other.trial is not None
-    theirs = [e for e in other.trial.model.effects if e.name == other.name]
-    if not theirs or winner.name not in {e.name for e in current.model.effects}:
-        return replace(other, trial=None)
-    model = current.model.without_effect(winner.name).with_effects(*theirs)
+    model = current.model.without_effect(winner.name).with_effects(effect)
     trial = challenge([model], study, current.hold, champion=current)
     lost = 0.0 if trial is None else trial.held_out.objective - current.held_out.objective
     return replace(other, trial=trial, gain=winner.gain - lost)

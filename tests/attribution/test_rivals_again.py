@@ -1,10 +1,20 @@
 """The law of an effect that was chosen while others were missing is compared again beside them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.candidate_refit import _with_form
+from fitting.attribution.rivals_again import _decided_again
+from fitting.attribution.screening import Screen
+from fitting.attribution.selection_round import Round, Verdict
+from fitting.attribution.study import Setting, Study
+from fitting.estimation.estimate import fit
+from fitting.estimation.experiment import whole
+from fitting.estimation.problem import Segmentation
 from fitting.loop import close_loop
 from fitting.outcome import kept_rounds
 from fitting.report.content import report_dict
@@ -30,6 +40,19 @@ def test_another_law_takes_over_the_strengths_that_it_has():
     assert known == pytest.approx([0.21, 1e-3, 0.3])
     (friction,) = _with_form(model, ViscousMotorFriction(b=0.0)).effects
     assert float(friction.b) == pytest.approx(1e-3)
+
+
+def test_tie_with_a_hold_stays_in_its_round():
+    """A hold is no effect that could take another's place in the final model."""
+    model = rig.drive_model().with_effects(DAHL)
+    found = fit(model, whole([rig.drive_experiment(128)]), (), Segmentation(64))
+    trial = Trial(model, found, found, "zero-order")
+    friction = Verdict("dahl_motor_friction", "motor_friction", trial, 1.0, 0.001, True)
+    hold = Verdict("linear hold", "input_delay", replace(trial, hold="linear"), 1.0, 0.001, False)
+    study = Study({}, Setting(Segmentation(64)))
+    for verdicts in ((friction, hold), (hold, friction)):
+        this = Round(trial, Screen((), np.zeros(1)), verdicts, True)
+        assert _decided_again(this, trial, study) == (this,)
 
 
 def test_simpler_law_replaces_one_that_followed_a_missing_effect():
