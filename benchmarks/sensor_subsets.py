@@ -39,7 +39,7 @@ class Kind:
         friction: share of the rms torque that Coulomb friction of the motor takes at most.
         current: whether the motor's current is logged in the place of its torque.
         noisy: noise of the logged torque, as a share of its rms value.
-        late: whether the load's encoder is read late by up to a sample interval.
+        late: the sensor that is read late, by up to a sample interval.
         load_friction: Coulomb friction of the load at most, as a share of N times the rms torque.
         gravity: largest torque of gravity on the load at most, likewise.
     """
@@ -49,7 +49,7 @@ class Kind:
     friction: float = 0.0
     current: bool = False
     noisy: float = 0.0
-    late: bool = False
+    late: str = ""
     load_friction: float = 0.0
     gravity: float = 0.0
 
@@ -60,13 +60,14 @@ class Kind:
             "motor_friction": self.friction,
             "load_friction": self.load_friction,
             "gravity_load": self.gravity,
-            "sensor_delay": self.late,
+            "sensor_delay": len(self.late),
             "inertia_error": self.inertias == "wrong",
         }
         return [family for family, size in there.items() if size]
 
 
 MOTOR, BOTH, BOTH_SPEEDS = ("motor_angle",), ("motor_angle", "load_angle"), ("motor_velocity", "load_velocity")
+TORQUE = ("motor_angle", "joint_torque")
 KINDS = {
     "motor angle": Kind(MOTOR),
     "motor angle, free inertias": Kind(MOTOR, "fit"),
@@ -75,20 +76,23 @@ KINDS = {
     "motor angle, friction, free inertias": Kind(MOTOR, "fit", 0.5),
     "motor angle, current": Kind(MOTOR, current=True),
     "motor velocity, friction": Kind(("motor_velocity",), friction=0.5),
-    "motor angle and joint torque, friction": Kind(("motor_angle", "joint_torque"), "fit", 0.5),
+    "motor angle and joint torque, friction": Kind(TORQUE, "fit", 0.5),
     "motor velocity and joint torque": Kind(("motor_velocity", "joint_torque")),
     "both velocities, friction": Kind(BOTH_SPEEDS, "fit", 0.5),
     "motor angle and load velocity": Kind(("motor_angle", "load_velocity"), "tolerance"),
     "both angles, friction": Kind(BOTH, "fit", 0.5),
     "both angles, free inertias": Kind(BOTH, "fit"),
     "both angles, noisy torque": Kind(BOTH, noisy=0.03),
-    "both angles, late encoder": Kind(BOTH, late=True),
+    "both angles, late encoder": Kind(BOTH, late="load_angle"),
     "motor angle, noisy torque": Kind(MOTOR, noisy=0.03),
     "both angles, friction of the load": Kind(BOTH, load_friction=0.8),
     "both angles, friction, gravity": Kind(BOTH, friction=0.5, gravity=1.0),
     "motor angle, wrong inertia": Kind(MOTOR, "wrong"),
     "both angles, wrong inertia": Kind(BOTH, "wrong"),
     "both angles, friction, wrong inertia": Kind(BOTH, "wrong", 0.5),
+    "motor angle, late joint torque": Kind(TORQUE, late="joint_torque"),
+    "motor angle, late joint torque, friction": Kind(TORQUE, "fit", 0.5, late="joint_torque"),
+    "late motor angle, joint torque": Kind(TORQUE, late="motor_angle"),
 }
 
 
@@ -111,9 +115,9 @@ class Joint:
     step: float
     torque: np.ndarray
 
-    def states(self) -> np.ndarray:
-        """(theta_m, theta_l, omega_m, omega_l) and what a late encoder reads of theta_l at the samples, from rest; the
-        torque is held between samples."""
+    def states(self) -> tuple[np.ndarray, np.ndarray]:
+        """(theta_m, theta_l, omega_m, omega_l) at the samples, and when a late sensor is read, from rest; the torque is
+        held between samples."""
 
         def rates(t, y, T):
             x, v = y[0] / self.N - y[1], y[2] / self.N - y[3]
@@ -124,13 +128,26 @@ class Joint:
 
         solver = ode(rates).set_integrator("dop853", rtol=1e-9, atol=1e-12, nsteps=100_000)
         solver.set_initial_value(np.zeros(4), 0.0)
-        found = np.zeros((self.torque.size, 5))
+        found, late = np.zeros((self.torque.size, 4)), np.zeros((self.torque.size, 4))
         for i, T in enumerate(self.torque.tolist()[:-1]):
             solver.set_f_params(T)
             if self.late:
-                found[i + 1, 4] = solver.integrate((i + 1) * self.step - self.late)[1]
-            found[i + 1, :4] = solver.integrate((i + 1) * self.step)
-        return found if self.late else np.column_stack([found[:, :4], found[:, 1]])
+                late[i + 1] = solver.integrate((i + 1) * self.step - self.late)
+            found[i + 1] = solver.integrate((i + 1) * self.step)
+        return found, late
+
+    def readings(self, states: np.ndarray) -> dict[str, tuple[np.ndarray, float]]:
+        """What each sensor reads, and the rms of what the twist does to it."""
+        theta_m, theta_l, omega_m, omega_l = states.T
+        x, v = theta_m / self.N - theta_l, omega_m / self.N - omega_l
+        tau = self.K * x + self.B_sp * v
+        return {
+            "motor_angle": (theta_m, self.N * np.std(x)),
+            "load_angle": (theta_l, np.std(x)),
+            "motor_velocity": (omega_m, self.N * np.std(v)),
+            "load_velocity": (omega_l, np.std(v)),
+            "joint_torque": (tau, np.std(tau)),
+        }
 
 
 def drawn(kind: Kind, random: np.random.Generator) -> Joint:
@@ -151,7 +168,7 @@ def drawn(kind: Kind, random: np.random.Generator) -> Joint:
     speed = rms / (J_m + J_l / N**2) / natural
     coulomb, viscous = (kind.friction * rms * random.uniform(0.2, 1.0) for _ in range(2))
     own = N, J_m, J_l, K, 2 * damping * np.sqrt(K * reduced), float(coulomb), float(viscous / speed)
-    late = kind.late * step * random.uniform(0.1, 1.0)
+    late = bool(kind.late) * step * random.uniform(0.1, 1.0)
     held = N * rms * kind.load_friction * random.uniform(0.2, 1.0) if kind.load_friction else 0.0
     gravity = N * rms * kind.gravity * random.uniform(0.2, 1.0) if kind.gravity else 0.0
     return Joint(*own, 2e-3 * speed, late, float(held), float(gravity), step, torque)
@@ -159,16 +176,8 @@ def drawn(kind: Kind, random: np.random.Generator) -> Joint:
 
 def written(folder: Path, kind: Kind, joint: Joint, random: np.random.Generator) -> None:
     """The joint's log and drive file; each sensor has white noise of a thousandth of what the twist does to it."""
-    theta_m, theta_l, omega_m, omega_l, seen_late = joint.states().T
-    x, v = theta_m / joint.N - theta_l, omega_m / joint.N - omega_l
-    tau = joint.K * x + joint.B_sp * v
-    sensors = {
-        "motor_angle": (theta_m, joint.N * np.std(x)),
-        "load_angle": (seen_late, np.std(x)),
-        "motor_velocity": (omega_m, joint.N * np.std(v)),
-        "load_velocity": (omega_l, np.std(v)),
-        "joint_torque": (tau, np.std(tau)),
-    }
+    in_time, late = (joint.readings(states) for states in joint.states())
+    sensors = {name: (late if name == kind.late else in_time)[name] for name in in_time}
     constant = 0.1
     columns = {"time": joint.step * np.arange(COUNT)}
     logged = joint.torque + kind.noisy * np.std(joint.torque) * random.normal(size=COUNT)

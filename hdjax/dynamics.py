@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -44,6 +44,20 @@ OUTPUTS = {
 }
 """Possible outputs of sensors, with their units. `motor_turn` is theta_m/N, all else as DESIGN names it."""
 _Kind = TypeVar("_Kind", bound=Effect)
+
+
+class Inputs(eqx.Module):
+    """Inputs of a model, at one instant or at many.
+
+    Attributes:
+        torque: motor torque [N m] after actuator effects, or the forcing.
+        load_torque: on the output [N m].
+        conditions: time and temperature.
+    """
+
+    torque: Float[Array, "*instants"]
+    load_torque: Float[Array, "*instants"]
+    conditions: Conditions
 
 
 class Model(eqx.Module):
@@ -88,8 +102,14 @@ class Model(eqx.Module):
         """
 
     @abc.abstractmethod
-    def outputs(self, state: State) -> Float[Array, " outputs"]:
-        """Outputs of the sensors: the quantities `measured`, of `OUTPUTS`; the last one is the principal output."""
+    def outputs(self, state: State, inputs: Inputs | None = None) -> Float[Array, " outputs"]:
+        """Outputs of the sensors: the quantities `measured`, of `OUTPUTS`; the last one is the principal output.
+
+        Args:
+            state: see `state_names`.
+            inputs: just before the reading, for a sensor of the joint torque that is read late; none act where not
+                given.
+        """
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -240,7 +260,7 @@ class TwoInertiaModel(Model):
         taken = (effect.inertia_taken(self.drive) for effect in self._of(kind))
         return sum(taken, jnp.zeros_like(self.drive.J_l))
 
-    def outputs(self, state: State) -> Float[Array, " outputs"]:
+    def outputs(self, state: State, inputs: Inputs | None = None) -> Float[Array, " outputs"]:
         theta_m, omega_m = state[0], state[2]
         theta_l, omega_l = self._load_as_read(state)
         for effect in self._of(SensorEffect):
@@ -253,26 +273,74 @@ class TwoInertiaModel(Model):
             "dynamic_error": lambda: turn - theta_l,
             "motor_velocity": lambda: omega_m,
             "load_velocity": lambda: omega_l,
-            JOINT_TORQUE: lambda: self._mesh_torque(self.motion(state), self._own_states(tuple(state))),
+            JOINT_TORQUE: lambda: self._torque_as_read(state, inputs),
         }
         return jnp.stack([readings[name]() for name in self.measured])
 
     def _load_as_read(self, state: State) -> tuple[Array, Array]:
         """The load's angle and rate when its sensors are read: Taylor's series to the third order in the delay, as the
         bare drive moves without a torque. What else moves the load counts to the first order."""
-        delays = [d for d in (effect.load_delay() for effect in self._of(SensorEffect)) if d is not None]
+        ahead = _ahead(effect.load_delay() for effect in self._of(SensorEffect))
         theta_l, omega_l = state[1], state[3]
-        if not delays:
+        if ahead is None:
             return theta_l, omega_l
-        motion, ahead = self.motion(state), -sum(delays, jnp.zeros(()))
-        mobility = 1.0 / self._load_inertia + 1.0 / (self._motor_inertia * self.drive.N**2)
-        untwisting = -mobility * self.drive.mesh_torque(motion.x, motion.v)
+        motion = self.motion(state)
+        untwisting = -self._mesh_mobility * self.drive.mesh_torque(motion.x, motion.v)
         torque, slope = jax.jvp(self.drive.mesh_torque, (motion.x, motion.v), (motion.v, untwisting))
         acceleration, jerk = torque / self._load_inertia, slope / self._load_inertia
         return (
             theta_l + ahead * (omega_l + ahead * (acceleration / 2.0 + ahead * jerk / 6.0)),
             omega_l + ahead * (acceleration + ahead * jerk / 2.0),
         )
+
+    def _torque_as_read(self, state: State, inputs: Inputs | None) -> Array:
+        """The mesh torque when its sensor is read: Taylor's series to the third order in the delay. The first order is
+        that of all effects; the others are those of the bare drive from its twist's acceleration on."""
+        conditions = Conditions() if inputs is None else inputs.conditions
+
+        def torque(*state: Array) -> Array:
+            return self._mesh_torque(self.motion(state, conditions), self._own_states(state))
+
+        ahead = _ahead(effect.torque_delay() for effect in self._of(SensorEffect))
+        if ahead is None:
+            return torque(*state)
+        if inputs is None:
+            nothing = jnp.zeros_like(state[0])
+            rates = dataclasses.replace(self, effects=()).component_rates(tuple(state)[:4], nothing, nothing)
+            rates += [nothing] * (len(state) - 4)
+        else:
+            rates = self.component_rates(tuple(state), inputs.torque, inputs.load_torque, conditions)
+        now, first = jax.jvp(torque, tuple(state), tuple(rates))
+
+        def twist(*state: Array) -> tuple[Array, Array]:
+            motion = self.motion(state, conditions)
+            return motion.x, motion.v
+
+        # The twist and its derivatives by time, and by them those of the bare drive's torque.
+        (x, v), (_, acceleration) = jax.jvp(twist, tuple(state), tuple(rates))
+        jerk = -self._mesh_mobility * first
+
+        def bare_first(x: Array, v: Array, acceleration: Array) -> Array:
+            return jax.jvp(self.drive.mesh_torque, (x, v), (v, acceleration))[1]
+
+        def bare_second(x: Array, v: Array, acceleration: Array, jerk: Array) -> Array:
+            return jax.jvp(bare_first, (x, v, acceleration), (v, acceleration, jerk))[1]
+
+        second = bare_second(x, v, acceleration, jerk)
+        snap = -self._mesh_mobility * second
+        third = jax.jvp(bare_second, (x, v, acceleration, jerk), (v, acceleration, jerk, snap))[1]
+        return now + ahead * (first + ahead * (second / 2.0 + ahead * third / 6.0))
+
+    @property
+    def _mesh_mobility(self) -> Array:
+        """Acceleration of the twist by a unit of mesh torque [1/(kg m^2)]."""
+        return 1.0 / self._load_inertia + 1.0 / (self._motor_inertia * self.drive.N**2)
+
+
+def _ahead(delays: Iterable[Array | None]) -> Array | None:
+    """Time by which a sensor is read ahead [s], from the delays of all effects; None without any."""
+    found = [delay for delay in delays if delay is not None]
+    return -sum(found, jnp.zeros(())) if found else None
 
 
 class TwistModel(Model):
@@ -284,7 +352,7 @@ class TwistModel(Model):
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         return Motion(x=state[0], v=state[1], **vars(conditions))
 
-    def outputs(self, state: State) -> Float[Array, "1"]:
+    def outputs(self, state: State, inputs: Inputs | None = None) -> Float[Array, "1"]:
         return state[:1]
 
     @abc.abstractmethod

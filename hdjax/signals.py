@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Float, Inexact, Int
 
 DEGREE = 5
 """Degree of the polynomial of an interval; 5 matches value, slope and curvature at both ends."""
@@ -36,8 +36,15 @@ class PiecewisePolynomial(eqx.Module):
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The signal's value at time `t` [s]; the end polynomials continue beyond the ends."""
-        last = self.coefficients.shape[0] - 1
-        k = jnp.clip(jnp.searchsorted(self.knots, t, side="right") - 1, 0, last)
+        return self._on(jnp.searchsorted(self.knots, t, side="right"), t)
+
+    def before(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """The limit of the signal's value from times before `t` [s]; at the first knot, from after it."""
+        return self._on(jnp.searchsorted(self.knots, t, side="left"), t)
+
+    def _on(self, following: Int[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+        """The value at a time by the polynomial that ends at this knot."""
+        k = jnp.clip(following - 1, 0, self.coefficients.shape[0] - 1)
         return polynomial(self.coefficients[k], t - self.knots[k])
 
     def affine(self, gain: _Number, offset: _Number) -> "PiecewisePolynomial":

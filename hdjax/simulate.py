@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from hdjax.dynamics import Model, State
+from hdjax.dynamics import Inputs, Model, State
 from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.results import Ending, SimulationError
 from hdjax.rubbing import over_step
@@ -197,7 +197,37 @@ def _simulate(
         ending = jnp.where(result == diffrax_result, int(ours), ending)
     failed = (result != dfx.RESULTS.successful) & (ending == int(Ending.successful))
     ending = jnp.where(failed, int(Ending.solver_failed), ending)
-    return Trajectory(times, states, jax.vmap(model.outputs)(states), ending)
+    return Trajectory(times, states, read(model, times, states, torque, load_torque, temperature), ending)
+
+
+def read(
+    model: Model,
+    times: Float[Array, " n"],
+    states: Float[Array, "n states"],
+    torque: Callable[[Array], Array],
+    load_torque: Callable[[Array], Array] | None,
+    temperature: Callable[[Array], Array] | None,
+) -> Float[Array, "n outputs"]:
+    """Outputs of a model's sensors along a motion.
+
+    Args:
+        model: the equations.
+        times: of the states [s].
+        states: by row.
+        torque: torque after `Model.actuate`.
+        load_torque: on the load; zero where None.
+        temperature: of the drive [K], or None.
+    """
+
+    def before(signal: Any, t: Array) -> Array:
+        return signal.before(t) if isinstance(signal, PiecewisePolynomial) else signal(t)
+
+    def one(t: Array, state: State) -> Array:
+        load = jnp.zeros_like(t) if load_torque is None else before(load_torque, t)
+        warmth = None if temperature is None else before(temperature, t)
+        return model.outputs(state, Inputs(before(torque, t), load, Conditions(time=t, temperature=warmth)))
+
+    return jax.vmap(one)(times, states)
 
 
 def march(

@@ -15,7 +15,7 @@ from hdjax.effects import Conditions
 from hdjax.noise import Noise
 from hdjax.results import Ending
 from hdjax.signals import PiecewisePolynomial
-from hdjax.simulate import Trajectory, no_torque, raise_failure, require_sampled
+from hdjax.simulate import Trajectory, no_torque, raise_failure, read, require_sampled
 
 _SPREAD = np.sqrt(1.0 / 8.0)
 # A class that diffrax documents but doesn't export.
@@ -192,4 +192,5 @@ def _simulate_noisy(
     states = jnp.asarray(solution.ys)
     ending = jnp.where(jnp.all(jnp.isfinite(states)), int(Ending.successful), int(Ending.not_finite))
     ending = jnp.where(solution.result == dfx.RESULTS.successful, ending, int(Ending.solver_failed))
-    return Trajectory(times, states, jax.vmap(model.outputs)(states[:, : len(model.state_names)]), ending)
+    outputs = read(model, times, states[:, : len(model.state_names)], torque, load_torque, None)
+    return Trajectory(times, states, outputs, ending)

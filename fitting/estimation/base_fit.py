@@ -17,9 +17,9 @@ import numpy as np
 from fitting.estimation.beside_friction import fits_of_starts, held_beside, refitted_beside
 from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.experiment import Stretch
+from fitting.estimation.experiment import Moved, Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
-from fitting.estimation.late_readings import with_load_moved
+from fitting.estimation.late_readings import moved_to
 from fitting.estimation.one_side import held_at, one_side_fit, with_known_priors
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
@@ -115,7 +115,7 @@ def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple
     if not late:
         return _fit_of_both_angles(model, training, halo)
     # Taken as logged like this, or a fit without an encoder's delay would move the readings back.
-    moved = [replace(s, experiment=replace(with_load_moved(s.experiment, late), load_moved=0.0)) for s in training]
+    moved = [replace(s, experiment=replace(moved_to(s.experiment, Moved(late)), moved=Moved())) for s in training]
     best, start, _ = _fit_of_both_angles(model, moved, halo)
     return _held_at(best, best.model, training, halo), start, None
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from math import comb
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +20,18 @@ from hdjax.dynamics import BOTH_ANGLES
 # Both assumed: largest step over the usual one, beyond which samples are inserted; most samples inserted per row.
 _LONGEST_STEP = 1.5
 _MOST_PUT_IN = 10
+
+
+class Moved(NamedTuple):
+    """Times by which a log's readings are from later rows [s].
+
+    Attributes:
+        load: those of the load's encoder.
+        joint_torque: those of the joint torque's sensor.
+    """
+
+    load: float = 0.0
+    joint_torque: float = 0.0
 
 
 class Experiment(Record):
@@ -40,8 +53,7 @@ class Experiment(Record):
         log: the name of the log that it is a part of.
         rate_std: relative standard deviation of the sample interval, from the rounding of the log's stamps.
         outputs: names of the measured outputs, see `hdjax.dynamics.OUTPUTS`.
-        load_moved: time by which the load's readings are from later rows [s], see
-            [`fitting.estimation.late_readings`][].
+        moved: times by which readings are from later rows, see [`fitting.estimation.late_readings`][].
         shaft_torques: unit torques on a shaft whose estimated strengths are part of the torques, or None, see
             [`fitting.estimation.one_side`][].
     """
@@ -59,7 +71,7 @@ class Experiment(Record):
     log: str = eqx.field(static=True, default="")
     rate_std: float = eqx.field(static=True, default=0.0)
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
-    load_moved: float = eqx.field(static=True, default=0.0)
+    moved: Moved = eqx.field(static=True, default=Moved())
     shaft_torques: Float[np.ndarray, "n torques"] | None = None
 
     def __len__(self) -> int:

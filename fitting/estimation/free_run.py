@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.experiment import Stretch
+from fitting.estimation.experiment import Moved, Stretch
 from fitting.estimation.free_parameters import FreeParameters, as_they_are
-from fitting.estimation.late_readings import aligned, moved_readings, with_load_moved
+from fitting.estimation.late_readings import aligned, moved_readings, moved_to
 from fitting.estimation.problem import Segmentation, suggested_substeps
 from fitting.estimation.reach import Condition, Quantity, Range, ranges, reach
 from fitting.estimation.residual import Problem, Unknowns
@@ -131,7 +131,7 @@ def free_run(
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    logged = [replace(s, experiment=with_load_moved(s.experiment, 0.0)) for s in stretches]
+    logged = [replace(s, experiment=moved_to(s.experiment, Moved())) for s in stretches]
     model, stretches = aligned(model, stretches)
     starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))
@@ -139,11 +139,11 @@ def free_run(
     problem = whole_simulations(model, free, stretches, halo, substeps)
     outputs = np.asarray(simulate(problem, Unknowns(values, states))[0])
     runs = []
-    late = stretches[0].experiment.load_moved
+    back = Moved(*(-by for by in stretches[0].experiment.moved))
     for stretch, output in zip(logged, outputs, strict=True):
         part = slice(stretch.start, stretch.stop)
         time, measured = stretch.experiment.time[part], stretch.experiment.measured[part]
-        simulated = moved_readings(time, output[: len(stretch)], model.measured, -late)
+        simulated = moved_readings(time, output[: len(stretch)], model.measured, back)
         pairs = {
             told: (factor * simulated[:, k], factor * measured[:, k])
             for k, (told, factor) in enumerate(zip(*as_logged(model), strict=True))
@@ -157,7 +157,7 @@ def free_run(
                 predicted=predicted,
                 measured=seen,
                 beside=pairs,
-                weight=stretch.weight * _within(time, time - late),
+                weight=stretch.weight * np.prod([_within(time, time + by) for by in back], axis=0),
                 output=principal,
                 reach=reach(stretch, model),
                 ranges=ranges(stretch, model),

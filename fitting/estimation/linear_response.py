@@ -16,6 +16,7 @@ from fitting.estimation.machine_code import actuated
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.segments import Segments
 from hdjax import Model, PiecewisePolynomial
+from hdjax.dynamics import Inputs
 from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.engine import unusable
 from hdjax.engine.equations import LOAD, TEMPERATURE
@@ -57,7 +58,8 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
     else:
         found = _response(model, problem, np.asarray(unknowns.states))
     states, transition, from_start, from_end = (np.asarray(a) for a in vars(found).values())
-    between, read = _between(model, states, problem.segments), readout(model, states[:, :-1])
+    between, samples = _between(model, states, problem.segments), np.zeros_like(problem.segments.width)
+    read = readout(model, states[:, :-1], inputs_at(model, problem.segments, samples))
     return Followed(states, between, transition, from_start, from_end, read)
 
 
@@ -70,14 +72,15 @@ def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segment
 
 
 def readout(
-    model: Model, states: Float[Array | np.ndarray, "*many states"]
+    model: Model, states: Float[Array | np.ndarray, "*many states"], inputs: Inputs | None = None
 ) -> Float[np.ndarray, "*many outputs states"]:
-    """Derivatives of the outputs by the state, at each of many states."""
-    return slopes_at_instants(_outputs, (states, states.ndim - 1), (model, 0))
+    """Derivatives of the outputs by the state, at each of many states and inputs."""
+    many = states.ndim - 1
+    return slopes_at_instants(_outputs, (states, many), (model, 0), (inputs, many))
 
 
-def _outputs(state: Array, model: Model) -> Array:
-    return model.outputs(state)
+def _outputs(state: Array, model: Model, inputs: Inputs | None) -> Array:
+    return model.outputs(state, inputs)
 
 
 @jit_small_lanes
@@ -121,20 +124,6 @@ def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments inte
 def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray) -> np.ndarray:
     """Values of polynomials at given times in their intervals."""
     return polyval(late, np.moveaxis(coefficients, -1, 0), tensor=False)
-
-
-class Inputs(eqx.Module):
-    """Inputs of a model at many instants.
-
-    Attributes:
-        torque: motor torque after actuator effects, or the forcing.
-        load_torque: on the output.
-        conditions: time and temperature.
-    """
-
-    torque: Float[Array, "*instants"]
-    load_torque: Float[Array, "*instants"]
-    conditions: Conditions
 
 
 def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segments samples *nodes"]) -> Inputs:

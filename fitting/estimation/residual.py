@@ -16,7 +16,7 @@ from fitting.record import Record
 from hdjax import Model
 from hdjax.compilation import library_of
 from hdjax.engine import Kernel
-from hdjax.simulate import march, simulate
+from hdjax.simulate import march, read, simulate
 from hdjax.where import where
 
 # Residual of a diverged simulation, in standard deviations, so that the step is rejected. (Its own square would
@@ -170,7 +170,7 @@ def simulate_segments(
             intervals=intervals,
             temperature=temperature,
         )
-        return jax.vmap(model.outputs)(states), end
+        return read(model, own.knots[:-1], states, own, load_torque, temperature), end
 
     one = solved if problem.engine == "diffrax" else marched
     return jax.vmap(one)(segments.torque, segments.load_torque, temperature, unknowns.states)

@@ -24,7 +24,7 @@ from fitting.estimation.weighing import whitening
 from fitting.next_experiment.excitation import Excitation, Limits
 from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
 from hdjax.lanes import jit_lanes
-from hdjax.simulate import march
+from hdjax.simulate import march, read
 
 # A refit has converged if another step would decrease its sum of squares by less than this share, or this value.
 _ARRIVED, _NOTHING = 1e-2, 1e-2
@@ -232,7 +232,7 @@ def _respond(
         warmth = PiecewisePolynomial(acting.knots, steady)
         state = drive.settled(setup.rest + entries[own : own + motions])
         states, _ = march(drive, acting, None, state, solver=dfx.Tsit5(), substeps=setup.substeps, temperature=warmth)
-        outputs = jax.vmap(drive.outputs)(states)
+        outputs = read(drive, jnp.asarray(acting.knots)[:-1], states, acting, None, warmth)
         moved = [states[:, 2], states[:, 0] - setup.rest[0]] if setup.units.size > 1 else []
         return outputs @ setup.white.T, jnp.stack([*moved, outputs[:, -1]], axis=1) / setup.units[None, :]
 

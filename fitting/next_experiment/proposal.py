@@ -333,7 +333,7 @@ def _on_logs(
 
 
 def _with_measured(stretch: Stretch, made: Experiment) -> Stretch:
-    own = {"measured": made.measured, "weight": made.weight, "load_moved": made.load_moved}
+    own = {"measured": made.measured, "weight": made.weight, "moved": made.moved}
     return replace(stretch, experiment=replace(stretch.experiment, **own))
 
 

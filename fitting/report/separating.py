@@ -152,7 +152,7 @@ _REVEALING = {
     "torque_sensor": "reverse the direction, and check the sensor with a known torque",
     "input_delay": "excite up to several times the natural frequency",
     "encoder_eccentricity": "pass slowly through the natural frequency",
-    "sensor_delay": "move the unloaded drive slowly to and fro: both encoders must read the same motion",
+    "sensor_delay": "move the unloaded drive slowly to and fro: all sensors must show the same motion",
     "creep": "stop under load and wait for minutes",
 }
 

@@ -44,7 +44,13 @@ from hdjax.effects.position import (
 )
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
-from hdjax.effects.sensing import LoadEncoderDelay, LoadEncoderEccentricity, MotorEncoderDelay, MotorEncoderEccentricity
+from hdjax.effects.sensing import (
+    JointTorqueDelay,
+    LoadEncoderDelay,
+    LoadEncoderEccentricity,
+    MotorEncoderDelay,
+    MotorEncoderEccentricity,
+)
 from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
@@ -73,6 +79,7 @@ __all__ = [
     "GravityLoad",
     "InputDelay",
     "InputLag",
+    "JointTorqueDelay",
     "KinematicError",
     "KinematicHarmonic",
     "KinematicSidebands",

@@ -32,6 +32,7 @@ from hdjax.effects.position import (
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import (
+    JointTorqueDelay,
     LoadEncoderDelay,
     LoadEncoderEccentricity,
     MotorEncoderDelay,
@@ -70,6 +71,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     InputLag,
     MotorEncoderDelay,
     LoadEncoderDelay,
+    JointTorqueDelay,
     GravityLoad,
     ConstantLoad,
     LoadDisturbance,

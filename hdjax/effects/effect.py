@@ -280,7 +280,11 @@ class SensorEffect(Effect):
         """Readings of the motor's and the load's encoder [rad] at the true angles [rad] and rates [rad/s]."""
 
     def load_delay(self) -> Array | None:
-        """Time by which the load's sensors are read later than the motor's [s]; None where they are read together."""
+        """Time by which the load's encoder is read later than the motor's [s]; None where they are read together."""
+        return None
+
+    def torque_delay(self) -> Array | None:
+        """Time by which the sensor of the joint torque is read later than the motor's encoder [s]; None likewise."""
         return None
 
 

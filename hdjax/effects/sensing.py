@@ -1,4 +1,4 @@
-"""Errors of the encoders: eccentric disc, delay."""
+"""Errors of the sensors: eccentric disc, delay."""
 
 from typing import ClassVar
 
@@ -73,18 +73,20 @@ class LoadEncoderEccentricity(SensorEffect):
         return amplitude_and_phase(self.cosine, self.sine, "rad")
 
 
-class EncoderDelay(SensorEffect):
-    """One side's sensors are read later than the other's, by a filter or their way over a bus.
+class SensorDelay(SensorEffect):
+    """A sensor is read later than the others, by a filter or its way over a bus.
 
-    What both are late by is an `input_delay`.
+    What all are late by is an `input_delay`.
 
     Attributes:
-        side: 1 where the load's sensors are late, -1 where the motor's are.
+        of_load: whether the delay makes the load's encoder later than the motor's, 1, or earlier, -1; else 0.
+        of_torque: likewise of the joint torque's sensor.
         moved: the part of the delay by which a log's readings have been moved already [s]; the law spans the rest.
     """
 
     family: ClassVar[str] = "sensor_delay"
-    side: ClassVar[float]
+    of_load: ClassVar[int]
+    of_torque: ClassVar[int]
 
     delay: Scalar = parameter(
         0.0,
@@ -100,24 +102,28 @@ class EncoderDelay(SensorEffect):
     @classmethod
     def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
         """A delay of whole rows between the sides: to first order in it, far too little of it may be seen."""
-        late = cls.side * scales.load_late
+        late = cls.of_load * scales.load_late
         return (({}, cls(delay=late)),) if late > 0.0 else ()
 
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l
 
-    def load_delay(self) -> Array:
-        return self.side * (self.delay - self.moved)
+    def load_delay(self) -> Array | None:
+        return self.of_load * (self.delay - self.moved) if self.of_load else None
+
+    def torque_delay(self) -> Array | None:
+        return self.of_torque * (self.delay - self.moved) if self.of_torque else None
 
 
-class MotorEncoderDelay(EncoderDelay, ActuatorEffect):
+class MotorEncoderDelay(SensorDelay, ActuatorEffect):
     """The motor's sensors read `theta_m(t - delay)`.
 
-    The simulation's time is that of the motor's reading: the torque is as late, and the load is read ahead.
+    The simulation's time is that of the motor's reading: the torque is as late, and all else is read ahead.
     """
 
     name: ClassVar[str] = "motor_encoder_delay"
-    side: ClassVar[float] = -1.0
+    of_load: ClassVar[int] = -1
+    of_torque: ClassVar[int] = -1
     takes_numpy: ClassVar[bool] = True
 
     @classmethod
@@ -129,11 +135,24 @@ class MotorEncoderDelay(EncoderDelay, ActuatorEffect):
         return logged.delayed(self.delay)
 
 
-class LoadEncoderDelay(EncoderDelay):
+class LoadEncoderDelay(SensorDelay):
     """The load's sensors read `theta_l(t - delay)`."""
 
     name: ClassVar[str] = "load_encoder_delay"
-    side: ClassVar[float] = 1.0
+    of_load: ClassVar[int] = 1
+    of_torque: ClassVar[int] = 0
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+
+class JointTorqueDelay(SensorDelay):
+    """The sensor of the joint torque reads `tau(t - delay)`."""
+
+    name: ClassVar[str] = "joint_torque_delay"
+    of_load: ClassVar[int] = 0
+    of_torque: ClassVar[int] = 1
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:

@@ -23,7 +23,7 @@ SIGNATURES: dict[str, str] = {
     "position_dependent_friction": "A ripple over the motor's angle that changes its sign with the direction.",
     "extra_resonance": "A zero and a pole at fixed frequencies; they need excitation and move with the load's inertia.",
     "temperature": "Stiffness, damping or friction drifts with the temperature channel.",
-    "sensor_delay": "The residual of one angle is proportional to its rate, whatever the torque.",
+    "sensor_delay": "The residual of one output is proportional to its rate, whatever the torque.",
     "encoder_eccentricity": "One or two cycles per revolution of an encoder, without a force: the natural frequency "
     "does not amplify them.",
 }

@@ -6,7 +6,7 @@ from hdjax.engine.code import LANES
 from hdjax.engine.emission import F64, I64
 from hdjax.engine.room import Room
 from hdjax.engine.rows import record, write_end, write_prior, write_products
-from hdjax.engine.steps import interval
+from hdjax.engine.steps import interval, surround_start
 
 
 def write_block(room: Room) -> None:
@@ -22,6 +22,7 @@ def write_block(room: Room) -> None:
     if room.jacobian:
         _begin_tangents(room)
     write_prior(room)
+    surround_start(room)
     with c.loop(room.samples) as i:
         record(room, i)
         go = c.builder.icmp_signed("<", i, c.load(room.needed, 0))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from hdjax.dynamics import Model
+from hdjax.dynamics import Inputs, Model
 from hdjax.effects import ActuatorEffect, Conditions, Rubbing
 from hdjax.engine.array_rules import Nodes
 from hdjax.engine.derivatives import Tangent, derivatives
@@ -51,7 +51,7 @@ class Equations:
         signals: inputs other than the torque: `LOAD`, `TEMPERATURE`.
         rates: of the states.
         held: values computed once per step.
-        outputs: of the sensors.
+        outputs: of the sensors; their signals are those just before the sample.
         prior: deviation of hidden initial states from their expected values, in units of their prior.
     """
 
@@ -181,8 +181,12 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
         torque, load, conditions = around(torque, time, beside)
         return model.component_rates(state, torque, load, dry.within(conditions, held))
 
+    def read(model: Model, state: list[Array], surrounding: list[Array]) -> Array:
+        torque, time, _, *beside = surrounding
+        return model.outputs(jnp.stack(state), Inputs(*around(torque, time, beside)))
+
     moved = translate(rates, frozen)
-    outputs = translate(lambda model, state, surrounding: model.outputs(jnp.stack(state)))[0]
+    outputs = translate(read)[0]
     hidden = translate(_prior)[0] if count > len(model.motion_states) else np.empty(0, dtype=object)
 
     one = graph.constant(1.0)

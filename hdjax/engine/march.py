@@ -77,6 +77,9 @@ class March:
             self._part(name, part)
             for name, part in (("rates", e.rates), ("held", e.held), ("outputs", e.outputs), ("prior", e.prior))
         )
+        read = [n for nodes in self._wanted(e.outputs) for n in nodes]
+        leaves = (e.graph.nodes[n][1][0] for n in e.graph.needed(read) if e.graph.nodes[n][0] == "leaf")
+        self.reads_signals = not {"signal", "time"}.isdisjoint(leaves)
         self._write()
 
     # -- the equations -------------------------------------------------------------------------------------------

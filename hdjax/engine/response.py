@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.dynamics import Model, State
+from hdjax.dynamics import Inputs, Model, State
 from hdjax.effects import Conditions, Effect, Motion
 from hdjax.engine.equations import LOAD, TEMPERATURE, numbers_of
 from hdjax.engine.kernel import Lanes, Marched, Wanted, kernel, march_arrays, threads
@@ -72,7 +72,7 @@ class Pushed(Model):
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return self.model.mobility(moved, opposed)
 
-    def outputs(self, state: State) -> Array:
+    def outputs(self, state: State, inputs: Inputs | None = None) -> Array:
         return state[:-1]
 
 

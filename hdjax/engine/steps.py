@@ -10,7 +10,26 @@ from hdjax.engine.room import POWERS, Room
 
 
 def interval(room: Room, i: ir.Value) -> None:
-    c, b, m = room.code, room.code.builder, room.march
+    c, b = room.code, room.code.builder
+    begin, end = _enter(room, i)
+    width, substeps = c.sub(end, begin), room.got("substeps", I64)
+    step = b.fdiv(width, c.spread(b.sitofp(substeps, F64)))
+    with c.loop(substeps) as j:
+        start = c.mul(c.spread(b.sitofp(j, F64)), step)
+        _step(room, begin, start, step)
+    if room.march.reads_signals:
+        _surround(room, begin, width)
+
+
+def surround_start(room: Room) -> None:
+    """Time and signals at the first sample, where the outputs depend on them."""
+    if room.march.reads_signals:
+        _surround(room, _enter(room, room.code.i(0))[0], room.code.number(0.0))
+
+
+def _enter(room: Room, i: ir.Value) -> tuple[ir.Value, ir.Value]:
+    """Load the signals' polynomials in a sample interval; its two ends."""
+    c, m = room.code, room.march
     for k in range(m.signals):
         powers, first = room.got(f"powers {k}", I64), room.got(f"first {k}", I64)
         row = c.times(c.plus(room.samples, first), powers)
@@ -20,11 +39,7 @@ def interval(room: Room, i: ir.Value) -> None:
             c.store(value, room.coefficients, c.plus(power, k * POWERS))
     at = c.plus(i, room.got("first 0", I64))
     begin, end = (room.lanes(room.got("knots"), room.knots, c.plus(at, late)) for late in (0, 1))
-    substeps = room.got("substeps", I64)
-    step = b.fdiv(c.sub(end, begin), c.spread(b.sitofp(substeps, F64)))
-    with c.loop(substeps) as j:
-        start = c.mul(c.spread(b.sitofp(j, F64)), step)
-        _step(room, begin, start, step)
+    return begin, end
 
 
 def _surround(room: Room, begin: ir.Value, late: ir.Value) -> None:

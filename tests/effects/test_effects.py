@@ -1,6 +1,7 @@
 """Laws that every effect of the catalogue obeys: zero strength, derivatives and energy."""
 
 import functools
+from dataclasses import replace
 
 import diffrax as dfx
 import equinox as eqx
@@ -12,7 +13,7 @@ from simulated_outputs import BASE, START, STEP, TIME, TORQUE, outputs, rms, slo
 import hdjax.effects
 from fitting.estimation.problem import stable_substeps
 from hdjax import TwoInertiaModel, sampled
-from hdjax.effects import CATALOGUE, Scales
+from hdjax.effects import CATALOGUE, JointTorqueDelay, Scales
 from hdjax.effects.creep import Creep
 from hdjax.effects.hysteresis import BoucWen, SharpBoucWen
 from hdjax.effects.position import ConservativePositionDependentStiffness
@@ -21,9 +22,14 @@ from hdjax.parameters import own_parameters
 from hdjax.simulate import march
 
 
+def base(form=None) -> TwoInertiaModel:
+    """The base model with sensors that see what the form changes; the last output shows it."""
+    return replace(BASE, measured=("motor_turn", "joint_torque")) if form is JointTorqueDelay else BASE
+
+
 @functools.cache
-def base_outputs(substeps=1):
-    return np.asarray(outputs(BASE, TORQUE, START, substeps))
+def base_outputs(form=None, substeps=1):
+    return np.asarray(outputs(base(form), TORQUE, START, substeps))
 
 
 @functools.cache
@@ -50,12 +56,13 @@ def scales() -> Scales:
 
 @functools.cache
 def at_strength(form, share: float):
-    """The base model with the effect, each of whose strengths alone changes the twist by this share to first order.
+    """The base model with the effect, each of whose strengths alone changes the last output by this share to first
+    order.
 
     All strengths are positive.
     """
     effect = form.proposals(scales())[0]
-    model = BASE.with_effects(effect)
+    model = base(form).with_effects(effect)
     values = {}
     found = slopes(model, TORQUE, START)
     for name, info in own_parameters(effect):
@@ -63,7 +70,7 @@ def at_strength(form, share: float):
             path = f"{form.name}.{name}"
             slope = np.asarray(found[path])[:, 1]
             assert rms(slope) > 0, f"{path} does nothing at zero strength"
-            values[path] = share * rms(base_outputs()[:, 1]) / rms(slope)
+            values[path] = share * rms(base_outputs(form)[:, 1]) / rms(slope)
     return model.replace(values)
 
 
@@ -76,11 +83,11 @@ DELAYED = ("input_delay", "input_lag", "motor_encoder_delay")
 @every_form
 def test_effect_of_zero_strength_is_the_base_model(form):
     for effect in form.proposals(scales()):
-        model = BASE.with_effects(effect)
-        base = base_outputs(stable_substeps(model, STEP))
+        model = base(form).with_effects(effect)
+        bare = base_outputs(form, stable_substeps(model, STEP))
         found = np.asarray(outputs(model, TORQUE, START))
         # Rounding over 200 steps; a delayed torque is late by 1e-9 of a step, which changes the twist by as much.
-        error = np.abs(found - base).max(axis=0) / np.abs(base).max(axis=0)
+        error = np.abs(found - bare).max(axis=0) / np.abs(bare).max(axis=0)
         assert error.max() < (1e-8 if form.name in DELAYED else 1e-12)
 
 
@@ -88,7 +95,8 @@ def test_effect_of_zero_strength_is_the_base_model(form):
 def test_effect_changes_the_motion_as_its_derivative_predicts(form):
     """By about a tenth for each strength, according to the derivative at zero."""
     model = at_strength(form, 0.1)
-    change = rms(np.asarray(outputs(model, TORQUE, START))[:, 1] - base_outputs()[:, 1]) / rms(base_outputs()[:, 1])
+    bare = base_outputs(form)[:, 1]
+    change = rms(np.asarray(outputs(model, TORQUE, START))[:, 1] - bare) / rms(bare)
     count = sum(info.role == "strength" for _, info in own_parameters(model.effects[0]))
     assert 0.03 < change < 0.3 * count
 
@@ -110,7 +118,7 @@ def test_gradients_by_strength_and_shape_agree_with_differences(form):
         found = np.asarray(gradients[path]) * value
         # Differences err by rounding, 1e-14 / 1e-6 of the angles, and where a kink lies between the two motions.
         np.testing.assert_allclose(found, differences, atol=1e-8 + 1e-4 * np.abs(found).max())
-        assert np.abs(found[:, 1]).max() > 1e-4 * np.abs(base_outputs()[:, 1]).max()
+        assert np.abs(found[:, 1]).max() > 1e-4 * np.abs(base_outputs(form)[:, 1]).max()
 
 
 # -- energy --

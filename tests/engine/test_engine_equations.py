@@ -12,6 +12,7 @@ import pytest
 import rig
 from fitting.estimation.free_parameters import fitted_paths
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel
+from hdjax.dynamics import Inputs
 from hdjax.effects import CATALOGUE, Conditions, DryFriction, Effect, Rubbing, Scales
 from hdjax.effects.actuation import TorqueBias, TorqueGain
 from hdjax.effects.friction import CoulombFriction, LoadFriction, MotorFriction
@@ -20,7 +21,9 @@ from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.learned import LEARNED, LEARNED_TORQUES, Learned, LearnedMeshTorque, LearnedMotorTorque
 from hdjax.effects.learned_axes import Axis, PeriodicAxis, SignAxis, axes_over
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY
+from hdjax.effects.sensing import JointTorqueDelay
 from hdjax.effects.stiffness import QuadraticStiffness
+from hdjax.effects.thermal import ThermalStiffness
 from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, Part, equations, split_model
 from hdjax.engine.graph import Graph
 from hdjax.engine.translate import traced, translated
@@ -123,6 +126,13 @@ SEVERAL = (
     TorqueGain(gain_error=0.05),
     TorqueBias(bias=0.03),
 )
+# A late sensor of the joint torque reads what the torque of the motor, friction and temperature did before.
+LATE = (
+    ThermalStiffness(k_T=-1e-3, T_0=303.0),
+    MotorFriction(T_c=0.02, transition=0.5),
+    TorqueGain(gain_error=0.05),
+    JointTorqueDelay(delay=3e-4),
+)
 
 
 @functools.cache
@@ -134,6 +144,8 @@ def models() -> dict[str, Model]:
     found |= {name: base.with_effects(effect) for name, effect in learned_effects().items()}
     found |= {form.name: with_nonzero_strengths(base.with_effects(proposed(form))) for form in LEARNED_WITH_MEMORY}
     found["several at once"] = with_nonzero_strengths(base.with_effects(*SEVERAL))
+    late = TwoInertiaModel(DRIVE, LATE, ("motor_turn", "joint_torque"))
+    found["joint torque read late"] = with_nonzero_strengths(late)
     for form in (QuadraticStiffness, CoulombFriction, BoucWen, TorqueBias):
         found[f"reduced, {form.name}"] = with_nonzero_strengths(reduced.with_effects(proposed(form)))
     return found
@@ -178,7 +190,8 @@ def by_jax(model: Model, paths: Sequence[str], signals: Sequence[str], acting: S
         return jnp.stack(own.component_rates(list(state), torque, load, conditions))
 
     def outputs(free, state, surrounding, held):
-        return joined([free[i] for i in range(len(paths))], others).outputs(state)
+        torque, load, conditions, _ = around(free, surrounding)
+        return joined([free[i] for i in range(len(paths))], others).outputs(state, Inputs(torque, load, conditions))
 
     def prior(free, state, surrounding, held):
         own, motion = joined([free[i] for i in range(len(paths))], others), len(model.motion_states)

@@ -123,6 +123,7 @@ TYPICAL = {
     "motor_friction": {"jitter": 0.2, "missing": 0.3},
     "maxwell_slip": {"joined": True, "hold": "linear"},
     "input_delay": {"loaded": True, "hold": "cubic", "jitter": 0.1},
+    "joint torque read late": {"loaded": True, "warm": True, "jitter": 0.1},
     "learned_mesh_torque of SplineAxis(x) x SplineAxis(v)": {"substeps": 2},
     "learned_mesh_torque of SignAxis(v) x AngleAxis(theta_m)": {"joined": True},
 }

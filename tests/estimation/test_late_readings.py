@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 import joints
 import rig
 from fitting.estimation.encoder_delay import delay_of_load
-from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log, whole
-from fitting.estimation.late_readings import aligned, is_aligned, unaligned, with_load_moved
+from fitting.estimation.experiment import Experiment, Moved, Stretch, experiment_from_log, whole
+from fitting.estimation.late_readings import aligned, is_aligned, moved_to, unaligned
 from hdjax import Drive, TwoInertiaModel
-from hdjax.effects.sensing import EncoderDelay, LoadEncoderDelay, MotorEncoderDelay
+from hdjax.effects.sensing import LoadEncoderDelay, MotorEncoderDelay, SensorDelay
 
 COUNT = 1500
 MODEL = rig.drive_model()
@@ -68,12 +68,12 @@ def test_moved_readings_are_those_of_the_undelayed_encoder(rows: int, invalid: i
     weight = np.ones(COUNT)
     weight[invalid] = 0.0
     late = replace(with_late_load(logged, rows), weight=weight)
-    moved = with_load_moved(late, rows * rig.STEP)
+    moved = moved_to(late, Moved(rows * rig.STEP))
     assert moved.weight is not None and moved.weight[invalid] == moved.weight[invalid - rows] == 0.0
     assert COUNT - 4 - abs(rows) <= np.sum(moved.weight) <= COUNT - 1 - abs(rows)
     valid = moved.weight > 0
     np.testing.assert_allclose(moved.measured[valid], logged.measured[valid], atol=1e-12)
-    back = with_load_moved(moved, 0.0)
+    back = moved_to(moved, Moved())
     valid = np.asarray(back.weight) > 0
     np.testing.assert_allclose(back.measured[valid], late.measured[valid], atol=1e-12)
 
@@ -84,9 +84,9 @@ def test_laws_of_aligned_delays_span_at_most_half_a_row(load: float, motor: floa
     late = MODEL.with_effects(*effects)
     model, (stretch,) = aligned(late, (Stretch(LOGS["nothing"], 0, COUNT),))
     assert is_aligned(model, (stretch,))
-    own = [e for e in model.effects if isinstance(e, EncoderDelay)]
+    own = [e for e in model.effects if isinstance(e, SensorDelay)]
     assert all(abs(float(e.load_delay())) <= 0.5001 * rig.STEP for e in own)
     rows = round(load) - round(motor)
-    assert stretch.experiment.load_moved == pytest.approx(rows * rig.STEP)
-    assert [float(e.moved) for e in unaligned(model).effects if isinstance(e, EncoderDelay)] == [0.0, 0.0]
-    assert aligned(MODEL, (stretch,))[1][0].experiment.load_moved == 0.0
+    assert stretch.experiment.moved == pytest.approx((rows * rig.STEP, -round(motor) * rig.STEP))
+    assert [float(e.moved) for e in unaligned(model).effects if isinstance(e, SensorDelay)] == [0.0, 0.0]
+    assert aligned(MODEL, (stretch,))[1][0].experiment.moved == Moved()
