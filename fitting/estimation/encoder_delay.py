@@ -51,10 +51,14 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     row = min(close, key=lambda row: left(row, width))
     if not left(row, width) < MOST_LEFT**2 * left(0, width):
         return 0.0
-    # Friction of the load with a memory shifts its phase as well, over wide test functions alone, and the motor's
-    # equation does not contain it. The likelihood depends on the product of all errors, where each has its own noise.
-    falls = [left(row, *how) / max(left(0, *how), 1e-300) for how in itertools.product(WIDTHS, ("load", "motor"))]
-    return row * step if np.prod(falls) < MOST_LEFT**2 else 0.0
+    # Friction shifts a phase as well, over wide test functions alone: of the load, which the motor's equation does not
+    # contain, or of the mesh. The likelihood depends on the product of all errors, where each has its own noise; narrow
+    # functions give more of them.
+    falls = [
+        max(WIDTHS) / width * np.log(max(left(row, width, side), 1e-300) / max(left(0, width, side), 1e-300))
+        for width, side in itertools.product(WIDTHS, ("load", "motor"))
+    ]
+    return row * step if sum(falls) < 2.0 * np.log(MOST_LEFT) else 0.0
 
 
 def _signals(stretch: Stretch) -> tuple[np.ndarray, ...]:

@@ -54,6 +54,29 @@ def test_friction_of_the_load_with_a_memory_is_no_delay(share: float):
     assert delay_of_load(model, whole([experiment])) == 0.0
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_of_the_mesh_over_many_turns_is_no_delay(seed: int):
+    """A controller lets the motor follow steps, and the mesh rubs in proportion to its teeth's ripple."""
+    N, J_m, J_l, K = 80.0, 8.3e-5, 0.055, 9650.0
+    random = np.random.default_rng(seed)
+    size, change = random.normal(size=6000), random.uniform(size=6000) < 0.005
+
+    def torque(theta_m, omega_m, wanted):
+        return wanted - 0.02 * theta_m - 0.01 * omega_m
+
+    def rates(y, wanted):
+        x, v = y[0] / N - y[1], y[2] / N - y[3]
+        tau = K * (x + 9e3 * x**3) + 0.6 * v + 0.7 * (1.0 + 0.6 * np.sin(2 * y[0])) * np.tanh(v / 1e-3)
+        return y[2], y[3], (torque(y[0], y[2], wanted) - tau / N) / J_m, tau / J_l
+
+    wanted = 0.5 * np.cumsum(size * change)
+    theta_m, theta_l, omega_m, _ = rig.rk4(rates, (0.0,) * 4, wanted, 1e-3, 20).T
+    motor, load = (a + noise * random.normal(size=6000) for a, noise in ((theta_m, 1e-4), (theta_l, 1.3e-6)))
+    log = rig.log_of_angles(motor, load, torque(theta_m, omega_m, wanted), ratio=N, step=1e-3, name="mesh")
+    model = TwoInertiaModel(Drive(N=N, J_m=J_m, J_l=J_l, K=1.0))
+    assert delay_of_load(model, whole([experiment_from_log(log, hold="linear", N=N)])) == 0.0
+
+
 def test_delay_is_not_looked_for_where_the_twist_was_not_measured():
     motor = replace(LOGS["nothing"], measured=LOGS["nothing"].measured[:, :1], outputs=("motor_angle",))
     model = TwoInertiaModel(MODEL.drive, measured=("motor_angle",))
