@@ -17,6 +17,7 @@ from fitting.estimation.free_parameters import fitted_paths
 from fitting.estimation.free_run import FreeRun, free_run, rms_error
 from fitting.estimation.problem import states_from
 from fitting.estimation.whole_log_fit import follows, over_whole_stretches, with_memory_carried, without_gaps
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -70,7 +71,8 @@ def attempt(
 
 
 def continued(trial: Trial, study: Study) -> Trial:
-    """A trial after a further pass of its fit; unchanged where that gains nothing.
+    """A trial after a further pass of its fit; unchanged where that gains nothing. A shape that the data don't
+    determine may run to a bound: that gains nothing on held-out data.
 
     Args:
         trial: the current one.
@@ -79,7 +81,13 @@ def continued(trial: Trial, study: Study) -> Trial:
     training = trained(trial.model, study, trial.hold, trial.training, _CONTINUED)
     if training.objective > trial.training.objective - LEAST_PROGRESS:
         return trial
-    return _judged(training, study, trial.hold)
+    found = _judged(training, study, trial.hold)
+    runs_away = _count_at_bounds(found.model) > _count_at_bounds(trial.model)
+    return trial if runs_away and found.gain_over(trial) < RULES.least_gain else found
+
+
+def _count_at_bounds(model: Model) -> int:
+    return sum(len(parameters_at_bounds(model, effect.name)) for effect in model.effects)
 
 
 def challenge(
