@@ -1,9 +1,12 @@
 """Fits of candidates: their solver steps, and the objective that they must reach."""
 
+from dataclasses import replace
+
 import pytest
 
 import rig
-from fitting.attribution.candidate_fit import attempt, challenge, halo_for
+from fitting.attribution import candidate_fit
+from fitting.attribution.candidate_fit import attempt, challenge, continued, halo_for
 from fitting.attribution.study import Data, Setting, Study
 from fitting.estimation.base_fit import base_fit
 from fitting.estimation.experiment import split
@@ -46,3 +49,19 @@ def test_candidate_that_explains_less_than_the_limit_is_rejected(base_trial_and_
     limit = before.training.objective - 20.0
     start = with_friction(before.model, 50.0, 0.3)
     assert challenge([start], study, HOLD, champion=before, give_up_above=limit) is None
+
+
+@pytest.mark.parametrize("gain, taken", [(0.0, False), (0.1, True)])
+def test_continued_fit_takes_a_shape_beyond_its_bound_only_for_a_gain(
+    base_trial_and_study, monkeypatch: pytest.MonkeyPatch, gain: float, taken: bool
+):
+    before, study = base_trial_and_study
+    trial = attempt(with_friction(before.model, 50.0, 0.3), study, HOLD)
+    training = replace(trial.training, objective=trial.training.objective - 0.1)
+    held_out = replace(trial.held_out, objective=trial.held_out.objective - gain)
+    beyond = replace(
+        trial, model=trial.model.replace({"coulomb_friction.v_0": -1.0}), training=training, held_out=held_out
+    )
+    monkeypatch.setattr(candidate_fit, "trained", lambda *_: training)
+    monkeypatch.setattr(candidate_fit, "_judged", lambda *_: beyond)
+    assert continued(trial, study) is (beyond if taken else trial)
