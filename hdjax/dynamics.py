@@ -294,8 +294,9 @@ class TwoInertiaModel(Model):
         )
 
     def _torque_as_read(self, state: State, inputs: Inputs | None) -> Array:
-        """The mesh torque when its sensor is read: Taylor's series to the third order in the delay. The first order is
-        that of all effects; the others are those of the bare drive from its twist's acceleration on."""
+        """The mesh torque when its sensor is read: Taylor's series to the fourth order in the delay. The first order is
+        that of all effects; the others are those of the bare drive from its twist's acceleration on, under a steady
+        torque."""
         conditions = Conditions() if inputs is None else inputs.conditions
 
         def torque(*state: Array) -> Array:
@@ -326,10 +327,15 @@ class TwoInertiaModel(Model):
         def bare_second(x: Array, v: Array, acceleration: Array, jerk: Array) -> Array:
             return jax.jvp(bare_first, (x, v, acceleration), (v, acceleration, jerk))[1]
 
+        def bare_third(x: Array, v: Array, acceleration: Array, jerk: Array, snap: Array) -> Array:
+            return jax.jvp(bare_second, (x, v, acceleration, jerk), (v, acceleration, jerk, snap))[1]
+
         second = bare_second(x, v, acceleration, jerk)
         snap = -self._mesh_mobility * second
-        third = jax.jvp(bare_second, (x, v, acceleration, jerk), (v, acceleration, jerk, snap))[1]
-        return now + ahead * (first + ahead * (second / 2.0 + ahead * third / 6.0))
+        third = bare_third(x, v, acceleration, jerk, snap)
+        twist_and_rates = x, v, acceleration, jerk, snap
+        fourth = jax.jvp(bare_third, twist_and_rates, (*twist_and_rates[1:], -self._mesh_mobility * third))[1]
+        return now + ahead * (first + ahead * (second / 2.0 + ahead * (third / 6.0 + ahead * fourth / 24.0)))
 
     @property
     def _mesh_mobility(self) -> Array:

@@ -28,15 +28,19 @@ _POSSIBLE_TIE = 0.5
 
 
 def worth_a_refit(screened: Screen, *, least: float) -> list[Lead]:
-    """Forms with a plausible p-value and a share of the best gain, best first.
+    """The best form, and others with a plausible p-value and a share of its gain, best first.
+
+    Where another form extrapolates wildly, all p-values are too large. So the best form is refitted in any case.
 
     Args:
         screened: the result of screening.
         least: smallest gain.
     """
-    if screened.leads:
-        least = max(least, _SHARE_OF_BEST * screened.leads[0].gain)
-    return [lead for lead in screened.leads if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT]
+    first, *others = screened.leads or [None]
+    if first is None or first.gain < least:
+        return []
+    least = max(least, _SHARE_OF_BEST * first.gain)
+    return [first, *(lead for lead in others if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT)]
 
 
 def first_of_each_family(leads: Sequence[Lead], suspects: Sequence[Lead] = ()) -> list[Lead]:

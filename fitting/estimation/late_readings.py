@@ -1,6 +1,8 @@
 """Whole rows of a sensor's delay: the late readings are moved by them, so that the effect's law spans the rest.
 
-The law is a series in the delay. A delay that is a large part of a natural period needs more terms than it has.
+The law is a series in the delay. A delay that is a large part of a natural period needs more terms than it has. The
+series of the joint torque contains the motor torque just before the reading, so that this sensor is read late, never
+ahead.
 """
 
 from collections.abc import Sequence
@@ -16,8 +18,8 @@ from hdjax.effects import Effect
 from hdjax.effects.sensing import SensorDelay
 from hdjax.parameters import as_scalar, own_parameters
 
-# Rows beyond which the law's part of a delay is too long; above a half, so that a delay of half a row settles.
-_LONGEST = 0.6
+# Rows by which a law's part of a delay may leave its row, so that a delay between two of them settles.
+_MARGIN = 0.1
 
 
 def aligned(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, tuple[Stretch, ...]]:
@@ -28,7 +30,7 @@ def aligned(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, tuple[St
         stretches: the data, as logged or moved.
     """
     step = stretches[0].experiment.time_step
-    effects = tuple(_moved(e, _whole_rows(e, step)) if isinstance(e, SensorDelay) else e for e in model.effects)
+    effects = tuple(_moved(e, _whole_rows(e, model, step)) if isinstance(e, SensorDelay) else e for e in model.effects)
     late = [(e, float(e.moved)) for e in effects if isinstance(e, SensorDelay)]
     by = Moved(sum(e.of_load * t for e, t in late), sum(e.of_torque * t for e, t in late))
     if all(s.experiment.moved == by for s in stretches):
@@ -40,8 +42,12 @@ def aligned(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, tuple[St
 def is_aligned(model: Model, stretches: Sequence[Stretch]) -> bool:
     """Whether the model's laws span less than a row of its delays."""
     step = stretches[0].experiment.time_step
-    late = [e for e in model.effects if isinstance(e, SensorDelay)]
-    return all(abs(float(e.delay - e.moved)) <= _LONGEST * step or float(e.moved) == _whole_rows(e, step) for e in late)
+    for effect in model.effects:
+        if isinstance(effect, SensorDelay) and float(effect.moved) != _whole_rows(effect, model, step):
+            beyond = float(effect.delay - effect.moved) / step - _least_part(effect, model)
+            if not -_MARGIN <= beyond <= 1.0 + _MARGIN:
+                return False
+    return True
 
 
 def unaligned(model: Model) -> Model:
@@ -49,10 +55,17 @@ def unaligned(model: Model) -> Model:
     return replace(model, effects=tuple(_moved(e, 0.0) if isinstance(e, SensorDelay) else e for e in model.effects))
 
 
-def _whole_rows(effect: SensorDelay, step: float) -> float:
-    """The whole rows nearest to the delay, within its bounds [s]."""
+def _whole_rows(effect: SensorDelay, model: Model, step: float) -> float:
+    """The whole rows of the delay, within its bounds [s]."""
     longest = dict(own_parameters(effect))["delay"].bounds[1]
-    return round(min(float(effect.delay), longest) / step) * step
+    return float(np.floor(min(float(effect.delay), longest) / step - _least_part(effect, model))) * step
+
+
+def _least_part(effect: SensorDelay, model: Model) -> float:
+    """The least part of a delay that is left to the law, which spans a row from there on [rows]."""
+    if JOINT_TORQUE not in model.measured or not effect.of_torque:
+        return -0.5
+    return 0.0 if effect.of_torque > 0 else -1.0
 
 
 def _moved(effect: SensorDelay, by: float) -> Effect:
