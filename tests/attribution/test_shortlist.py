@@ -21,7 +21,7 @@ def test_form_with_too_small_gain_is_not_refitted():
     assert worth_a_refit(SCREEN, least=1e-4) == [CREEP, QUADRATIC]
 
 
-def test_form_with_gain_explained_by_chance_is_not_refitted():
+def test_form_with_gain_explained_by_chance_is_refitted_only_if_it_is_the_best():
     assert worth_a_refit(Screen(SCREEN.leads, np.full(199, 2.0)), least=1e-4) == [SCREEN.leads[0]]
 
 
