@@ -100,8 +100,13 @@ class SensorDelay(SensorEffect):
     moved: Scalar = eqx.field(default=0.0, converter=as_scalar, kw_only=True)
 
     @classmethod
+    def typical(cls, scales: Scales) -> tuple[Effect, ...]:
+        """Half a row: to first order in it, far too little of a delay may be seen."""
+        return (cls(delay=0.5 * scales.time_step),)
+
+    @classmethod
     def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
-        """A delay of whole rows between the sides: to first order in it, far too little of it may be seen."""
+        """A delay of whole rows between the sides."""
         late = cls.of_load * scales.load_late
         return (({}, cls(delay=late)),) if late > 0.0 else ()
 
