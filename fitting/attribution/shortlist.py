@@ -36,9 +36,9 @@ def worth_a_refit(screened: Screen, *, least: float) -> list[Lead]:
         screened: the result of screening.
         least: smallest gain.
     """
-    first, *others = screened.leads or [None]
-    if first is None or first.gain < least:
+    if not screened.leads or screened.leads[0].gain < least:
         return []
+    first, *others = screened.leads
     least = max(least, _SHARE_OF_BEST * first.gain)
     return [first, *(lead for lead in others if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT)]
 
