@@ -18,7 +18,8 @@ from hdjax.effects import Effect
 from hdjax.effects.sensing import SensorDelay
 from hdjax.parameters import as_scalar, own_parameters
 
-# Rows by which a law's part of a delay may leave its row, so that a delay between two of them settles.
+# Rows by which a law's part of a delay may leave its row, so that a delay between two of them settles. Assumed: the
+# series is as accurate there.
 _MARGIN = 0.1
 
 

@@ -36,7 +36,9 @@ class Shown(eqx.Module):
     def of(cls, model: Model, swing: float) -> "Shown":
         """From a model's states."""
         count = len(model.motion_states) // 2
-        slopes = readout(model, model.rest())
+        # At rest no temperature is known.
+        steady = replace(model, effects=tuple(e for e in model.effects if not e.needs_temperature))
+        slopes = readout(steady, steady.rest())
         hidden = np.concatenate([np.zeros(0), *(np.asarray(e.state_scale()) for e in model.effects if e.states)])
         sides = None
         if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:

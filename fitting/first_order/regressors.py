@@ -176,7 +176,8 @@ def _readings(
 ) -> Float[np.ndarray, "segments samples outputs columns"]:
     """Derivatives of the outputs at the samples for a fixed motion."""
     own = np.moveaxis(states[:, :-1], 2, 0)
-    return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], own=own)
+    inputs = inputs_at(seen.model, seen.segments, np.zeros_like(seen.segments.width))
+    return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], inputs, own=own)
 
 
 def _rates(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
@@ -184,5 +185,5 @@ def _rates(strengths: Array, effect: Effect, model: Model, state: Array, inputs:
     return whole.rates(states, inputs.torque, inputs.load_torque, inputs.conditions)[: state.size]
 
 
-def _outputs(strengths: Array, effect: Effect, model: Model, state: Array, own: Array) -> Array:
-    return model.with_effects(_with(effect, strengths)).outputs(jnp.concatenate([state, own]))
+def _outputs(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
+    return model.with_effects(_with(effect, strengths)).outputs(jnp.concatenate([state, own]), inputs)

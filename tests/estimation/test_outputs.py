@@ -18,6 +18,7 @@ from fitting.estimation.linear_response import readout
 from fitting.estimation.observed_states import observed_states
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.starting_values import starting_models
+from fitting.estimation.weighing import Shown
 from fitting.fit_drive import fit_only
 from fitting.report.content import report_dict
 from fitting.report.plots.gallery import fit_plots
@@ -25,6 +26,7 @@ from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Drive, TwoInertiaModel
 from hdjax.drive import Prior
 from hdjax.dynamics import OUTPUTS
+from hdjax.effects import ThermalStiffness
 
 JOINT = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05)
 COUNT = 2500
@@ -168,3 +170,12 @@ def test_joint_torque_output_equals_the_mesh_torque():
     model = true_model(("joint_torque",))
     state = jnp.array([1.0, 0.018, 5.0, 0.03])
     assert float(model.outputs(state)[0]) == pytest.approx(JOINT.K * 0.002 + JOINT.B_sp * 0.07, rel=1e-12)
+
+
+def test_joint_torque_is_weighed_beside_an_effect_of_temperature():
+    """At rest, where no temperature is known."""
+    measured = ("motor_angle", "joint_torque")
+    warm = true_model(measured).with_effects(ThermalStiffness(k_T=-1e-3, T_0=300.0))
+    bare, found = Shown.of(true_model(measured), 1.0), Shown.of(warm, 1.0)
+    np.testing.assert_array_equal(found.angles, bare.angles)
+    np.testing.assert_array_equal(found.rates, bare.rates)
