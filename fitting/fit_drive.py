@@ -16,7 +16,7 @@ from fitting.progress import Progress, silent
 from fitting.uncertainty.measurement_noise import measurement_noise
 from fitting.uncertainty.posterior import posterior
 from fitting.uncertainty.prediction_band import prediction_bands
-from fitting.validation.account import account
+from fitting.validation.account import account, of_parameters
 from fitting.validation.frequency_response import frequency_response
 from fitting.validation.goodness_of_fit import goodness
 from fitting.validation.residual_diagnostics import diagnose
@@ -55,24 +55,18 @@ def fit_only(
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    source, assumed = "torque", {}
-    if fixed_by is not None and isinstance(fixed_by.model, OneSideModel):
-        source = f"{fixed_by.model.equation} equation"
-        base, assumed = _without_priors(base, fixed_by.model.scaled_by)
-    elif fixed_by is not None:
-        source = "torque beside friction"
+    base, source, assumed = _parameters_from(base, fixed_by)
     found = base if is_held(base) else long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs")
-    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True, std_from=fixed_by)
-    seen = found.stretches if not tests else tests
-    bands = prediction_bands(found, result.uncertainty, seen, noise=noise, runs=result.judged)
+    known = of_parameters(found, profiles=True, std_from=fixed_by)
+    result = account(found, found.stretches, tests, noise=noise, halo=0, known=known)
+    bands = prediction_bands(found, result.uncertainty, tests or found.stretches, noise=noise, runs=result.judged)
     clock.lap("free runs and standard errors")
     residual = diagnose(found)
-    tests = residual_tests(found, residual)
-    response = frequency_response(
-        found.model, experiments[hold], hold=hold, noise=float(np.sqrt(np.asarray(noise)[-1, -1]))
-    )
+    checked = residual_tests(found, residual)
+    noise_std = float(np.sqrt(np.asarray(noise)[-1, -1]))
+    response = frequency_response(found.model, experiments[hold], hold=hold, noise=noise_std)
     clock.lap("diagnostics")
     draws = None
     if seed is not None:
@@ -85,7 +79,7 @@ def fit_only(
         noise=noise,
         hold=hold,
         residual=residual,
-        tests=tests,
+        tests=checked,
         goodness=goodness(found, result, noise),
         frequency_response=response,
         bands=bands,
@@ -112,6 +106,16 @@ def _base(
         return hold, fits[hold], experiments, test
     experiments, test = with_intervals(experiments, factors), with_intervals(test, factors)
     return hold, base_fit(model, whole(experiments[hold])), experiments, test
+
+
+def _parameters_from(base: Fit, fixed_by: Fit | None) -> tuple[Fit, str, dict[str, float]]:
+    """The base fit; what determines its parameters; and values that were assumed for that."""
+    if fixed_by is None:
+        return base, "torque", {}
+    if not isinstance(fixed_by.model, OneSideModel):
+        return base, "torque beside friction", {}
+    base, assumed = _without_priors(base, fixed_by.model.scaled_by)
+    return base, f"{fixed_by.model.equation} equation", assumed
 
 
 def _without_priors(base: Fit, scaled_by: Collection[str]) -> tuple[Fit, dict[str, float]]:

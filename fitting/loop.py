@@ -29,7 +29,7 @@ from fitting.progress import Progress, silent
 from fitting.search_options import SearchOptions
 from fitting.uncertainty.measurement_noise import excess
 from fitting.uncertainty.one_side import without_mesh_priors
-from fitting.validation.account import Account, account, free_runs
+from fitting.validation.account import Account, account, free_runs, of_parameters
 from fitting.validation.residual_diagnostics import diagnose
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
@@ -146,8 +146,9 @@ class _Closed:
         def accounted(trial: Trial, fitted: Fit, runs: tuple[FreeRun, ...], side: Fit | None = None) -> Account:
             fitted = eqx.tree_at(lambda f: f.model, fitted, without_mesh_priors(fitted.model))
             both, test = refitted_on_all(fitted, trial.held_out), tests.get(trial.hold, ())
-            known = {"noise": end.noise, "halo": self.study.setting.halo}
-            return account(both, self.study.data[trial.hold][0], test, selection=runs, drive_from=side, **known)
+            training, halo = self.study.data[trial.hold][0], self.study.setting.halo
+            known = of_parameters(both, drive_from=side)
+            return account(both, training, test, noise=end.noise, halo=halo, selection=runs, known=known)
 
         after = accounted(end.final, end.fitted, end.runs, end.side)
         if end.final is self.base:

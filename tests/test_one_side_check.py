@@ -18,7 +18,7 @@ from fitting.loop import close_loop
 from fitting.one_side_check import better_side, source_of
 from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
-from fitting.validation.account import account
+from fitting.validation.account import of_parameters
 from hdjax import Drive, TwoInertiaModel
 from hdjax.drive import Prior
 from hdjax.effects import ViscousMotorFriction
@@ -62,7 +62,7 @@ def test_side_that_does_not_rub_supplies_the_parameters(source: str):
     assert fixed.held == long.held == MESH
     assert float(both.model.get("viscous_motor_friction.b")) != float(found.model.get("viscous_motor_friction.b"))
 
-    known = account(both, both.stretches, (), noise=both.covariance, halo=0, drive_from=side).uncertainty
+    known, _ = of_parameters(both, drive_from=side)
     own = uncertainty(both).estimates["viscous_motor_friction.b"]
     assert known.estimates == uncertainty(side).estimates | {"viscous_motor_friction.b": own}
     assert np.all(np.linalg.eigvalsh(known.correlation) > 0.0)

@@ -38,6 +38,10 @@ from fitting.logs.split_stamps import partners, with_joined_stamps
 from fitting.logs.time_stamps import TimeBase
 
 _SLOWEST = 60.0  # s between samples; too slow for a drive's resonance, so that the unit of time must be wrong
+_AS_LOGGED = (
+    *("motor_angle", "load_angle", "motor_torque", "load_torque", "joint_torque"),
+    *("motor_velocity", "load_velocity", "temperature", "forcing"),
+)
 _UNTIMED = Finding(
     "note",
     "there is no time column",
@@ -167,12 +171,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
             is_output = outputs_until is not None and signal in (*required[:-1], *OUTPUTS)
             column = _cut(raw[signal], start, stop, start + outputs_until if is_output and outputs_until else stop)
             channels[signal] = channel(path, drive_file, signal, column, first_row=start)
-    if kind == "quasi-static" and "time" not in raw and not (drive_file.sample_rate or table.sample_rate):
-        # The torque-twist curve does not depend on the rate.
-        rows = np.arange(start, stop)
-        base = TimeBase(rows - start, rows.astype(float), np.zeros(0, dtype=int), (_UNTIMED,))
-    else:
-        base = _time(path, drive_file, table, raw.get("time"), channels, start, stop)
+    base = _time(path, drive_file, table, kind, raw.get("time"), channels, slice(start, stop))
     if len(base.time) < SHORTEST:
         raise DataError(f"{path}: only {len(base.time)} rows have a valid stamp; a fit needs {SHORTEST}")
     findings = [*joined, *told, *(f for c in channels.values() for f in c.findings), *base.findings]
@@ -183,28 +182,21 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     trusted, untold = trusted_rows(path, drive_file, signals, seen, outputs_until, asked, own_clocks=own_clocks)
     known, spans, gaps = input_rows(path, drive_file, base, signals, required[-1], outputs_until)
     findings += [*untold, *gaps, *interpolated(path, drive_file, base.time, signals)]
+    as_logged: dict[str, Any] = {name: signals.get(name) for name in _AS_LOGGED}
     log = Log(
         name=path.stem,
         path=path,
         kind=kind,
         time=base.time,
-        motor_angle=signals.get("motor_angle"),
-        load_angle=signals.get("load_angle"),
-        motor_torque=signals.get("motor_torque"),
-        load_torque=signals.get("load_torque"),
-        temperature=signals.get("temperature"),
         dynamic_error=_twist(path, drive_file, kind, signals),
-        forcing=signals.get("forcing"),
         units={s: channels[s].unit for s in REDUCED_SIGNALS} if kind == "reduced" else {"dynamic_error": "rad"},
         findings=tuple(findings),
-        motor_velocity=signals.get("motor_velocity"),
-        load_velocity=signals.get("load_velocity"),
         outputs_until=outputs_until,
         trusted=None if trusted.all() else trusted,
         input_known=None if known.all() else known,
         pieces=None if [*spans] == [(0, len(known))] or outputs_until is not None else spans,
-        joint_torque=signals.get("joint_torque"),
         rate_std=base.rate_std,
+        **as_logged,
     )
     for array in (log.time, log.dynamic_error, *signals.values()):
         if array is not None:
@@ -314,11 +306,16 @@ def _time(
     path: Path,
     drive_file: DriveFile,
     table: RawTable,
+    kind: Kind,
     column: RawColumn | None,
     channels: Mapping[str, Channel],
-    start: int,
-    stop: int,
+    seen: slice,
 ) -> TimeBase:
+    start, stop = seen.start, seen.stop
+    if kind == "quasi-static" and column is None and not (drive_file.sample_rate or table.sample_rate):
+        # The torque-twist curve does not depend on the rate.
+        rows = np.arange(start, stop)
+        return TimeBase(rows - start, rows.astype(float), np.zeros(0, dtype=int), (_UNTIMED,))
     stated, beside = drive_file.sample_rate, table.sample_rate
     if stated and beside and abs(stated / beside - 1) > 0.001:
         raise InputError(

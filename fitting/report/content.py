@@ -18,7 +18,6 @@ from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
 from fitting.report.outputs import noise_of_outputs, units_of_outputs
 from fitting.report.parameters import PARTS, account_dict, effect_dict, no_account
-from fitting.report.posterior import posterior_dict
 from fitting.report.proposal import proposal_dict
 from fitting.report.rules import rules_dict
 from fitting.report.steps import steps
@@ -55,12 +54,6 @@ def report_dict(
     output = list(noise)[-1]
     x_max = largest_twist(outcome)
     is_loop = isinstance(outcome, Loop)
-    start = None if is_loop else outcome.start
-    after = no_account()
-    if isinstance(outcome, Loop):
-        after = account_dict(outcome.after, units, x_max)
-        if outcome.parameters_from == "torque":
-            widen_by_ties(after, outcome, x_max)
     report = {
         "schema": SCHEMA,
         "version": version("hdjax"),
@@ -68,19 +61,15 @@ def report_dict(
         "decision": outcome.decision,
         "judged_on": list(outcome.after.parts())[-1],
         "summary": "",
-        "times_noise": outcome.times_noise if is_loop else None,
-        "rules": rules_dict(outcome.checks) if is_loop else [],
-        "evidence": dataclasses.asdict(outcome.case) if is_loop else None,
+        "times_noise": None,
+        "rules": [],
+        "evidence": None,
         "output": output,
         "units": units,
-        "noise": noise
-        | {
-            "memory": outcome.noise_memory if is_loop else None,
-            "torque": outcome.torque_noise if is_loop else None,
-        },
+        "noise": noise | {"memory": None, "torque": None},
         "parameters_from": outcome.parameters_from,
-        "before": account_dict(outcome.before, units, x_max, start=start),
-        "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
+        "before": account_dict(outcome.before, units, x_max, start=None if is_loop else outcome.start),
+        "after": _after(outcome, units, x_max),
         "extrapolation": _extrapolation(outcome, units),
         "identifiability": identifiability_dict(outcome.after.identifiability, units),
         "steps": steps(outcome),
@@ -95,12 +84,13 @@ def report_dict(
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
         "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
+        "hold": outcome.hold,
+        "setting": None,
         **_circumstances(outcome),
         "health": [{"log": log} | dataclasses.asdict(f) for log, f in health],
         "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
     }
-    if not is_loop:
-        report |= fit_dict(outcome, noise[output]) | {"posterior": posterior_dict(outcome.posterior)}
+    report |= _of_loop(outcome, noise) if is_loop else fit_dict(outcome, noise[output])
     report = finite(report)
     if is_loop:
         say_what_intervals_hold(report, outcome.times_noise)
@@ -108,6 +98,35 @@ def report_dict(
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)
     return with_old_names(report)
+
+
+def _after(outcome: Outcome, units: Mapping[str, str], x_max: float) -> dict[str, Any]:
+    """The final model of a loop; a fit has none."""
+    if not isinstance(outcome, Loop):
+        return no_account() | {"effects": []}
+    after = account_dict(outcome.after, units, x_max)
+    if outcome.parameters_from == "torque":
+        widen_by_ties(after, outcome, x_max)
+    return after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]}
+
+
+def _of_loop(outcome: Loop, noise: Mapping[str, Any]) -> dict[str, Any]:
+    """What only a loop has: evidence, checks, noise with memory and of the torque, settings."""
+    setting = {
+        "horizon": outcome.setting.segmentation.horizon,
+        "halo": outcome.setting.halo,
+        "substeps": outcome.after_substeps,
+        "count": outcome.setting.segmentation.count,
+        "least_progress": outcome.setting.least_progress,
+        "thorough": outcome.setting.thorough,
+    }
+    return {
+        "times_noise": outcome.times_noise,
+        "rules": rules_dict(outcome.checks),
+        "evidence": dataclasses.asdict(outcome.case),
+        "noise": dict(noise) | {"memory": outcome.noise_memory, "torque": outcome.torque_noise},
+        "setting": setting,
+    }
 
 
 def _extrapolation(outcome: Outcome, units: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -129,21 +148,9 @@ def _extrapolation(outcome: Outcome, units: Mapping[str, str]) -> list[dict[str,
 
 
 def _circumstances(outcome: Outcome) -> dict[str, Any]:
-    """Data and settings of the outcome."""
+    """Data and computation of the outcome."""
     not_machine_code = outcome.after.not_machine_code
-    setting = None
-    if isinstance(outcome, Loop):
-        setting = {
-            "horizon": outcome.setting.segmentation.horizon,
-            "halo": outcome.setting.halo,
-            "substeps": outcome.after_substeps,
-            "count": outcome.setting.segmentation.count,
-            "least_progress": outcome.setting.least_progress,
-            "thorough": outcome.setting.thorough,
-        }
     return {
-        "hold": outcome.hold,
-        "setting": setting,
         "engine": {"name": "machine code" if not_machine_code is None else "XLA", "reason": not_machine_code},
         "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
         "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),

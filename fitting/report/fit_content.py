@@ -1,4 +1,4 @@
-"""Content of a fit's report only: goodness, residual tests, frequency response, and their interpretation."""
+"""Content of a fit's report only: goodness, residual tests, frequency response, posterior, and their interpretation."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from fitting import formatting
 from fitting.outcome import FitOnly
 from fitting.report.outputs import in_words
+from fitting.report.posterior import posterior_dict
 from fitting.uncertainty.prediction_band import coverage
 from fitting.validation.frequency_response import (
     FrequencyResponse,
@@ -64,6 +65,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
             for t in fitted.tests.tests
         ],
         "frequency_response": _response_dict(fitted.frequency_response),
+        "posterior": posterior_dict(fitted.posterior),
     }
 
 

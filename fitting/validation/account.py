@@ -68,9 +68,7 @@ def account(
     noise: Float[Array, "outputs outputs"],
     halo: int,
     selection: tuple[FreeRun, ...] = (),
-    profiles: bool = False,
-    std_from: Fit | None = None,
-    drive_from: Fit | None = None,
+    known: tuple[Uncertainty, Identifiability] | None = None,
 ) -> Account:
     """Free runs, standard errors and identifiability of a fit.
 
@@ -81,13 +79,26 @@ def account(
         noise: covariance of the measurement noise.
         halo: intervals of torque before a stretch.
         selection: free runs along the selection stretches.
+        known: what is known of its parameters ([`of_parameters`][]); by the fit alone if None.
+    """
+    # Separate runs, so that test data do not share the scale of a window.
+    seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
+    found, told = of_parameters(fit) if known is None else known
+    return Account(unaligned(fit.model), found, seen, selection, unseen, told, why_not(fit.problem))
+
+
+def of_parameters(
+    fit: Fit, *, profiles: bool = False, std_from: Fit | None = None, drive_from: Fit | None = None
+) -> tuple[Uncertainty, Identifiability]:
+    """Standard errors and identifiability of the parameters of a fit.
+
+    Args:
+        fit: the fitted model.
         profiles: whether profile likelihood replaces inaccurate intervals, which compiles a further program.
         std_from: another fit of the same parameters that supplies their standard errors.
         drive_from: the fit of one side's equation at which the drive's parameters are fixed, and which supplies their
             standard errors.
     """
-    # Separate runs, so that test data do not share the scale of a window.
-    seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
     judged = fit if std_from is None else std_from
     found = uncertainty(judged)
     if profiles:
@@ -95,9 +106,7 @@ def account(
     if drive_from is not None:
         found = found.with_parameters_of(uncertainty(drive_from).in_units_of(fit, drive_from))
     told = identifiability(judged, found)
-    if std_from is not None:
-        found = found.in_units_of(fit, std_from)
-    return Account(unaligned(fit.model), found, seen, selection, unseen, told, why_not(fit.problem))
+    return (found if std_from is None else found.in_units_of(fit, std_from)), told
 
 
 def free_runs(
