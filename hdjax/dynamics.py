@@ -26,6 +26,7 @@ from hdjax.effects import (
 )
 from hdjax.parameters import ParameterInfo, as_scalar, own_parameters, own_value
 from hdjax.signals import PiecewisePolynomial
+from hdjax.taylor import taylor, time_derivative
 
 State = Float[Array, " states"]
 
@@ -285,13 +286,10 @@ class TwoInertiaModel(Model):
         if ahead is None:
             return theta_l, omega_l
         motion = self.motion(state)
-        untwisting = -self._mesh_mobility * self.drive.mesh_torque(motion.x, motion.v)
-        torque, slope = jax.jvp(self.drive.mesh_torque, (motion.x, motion.v), (motion.v, untwisting))
-        acceleration, jerk = torque / self._load_inertia, slope / self._load_inertia
-        return (
-            theta_l + ahead * (omega_l + ahead * (acceleration / 2.0 + ahead * jerk / 6.0)),
-            omega_l + ahead * (acceleration + ahead * jerk / 2.0),
-        )
+        torque = self.drive.mesh_torque(motion.x, motion.v)
+        slope = time_derivative(self.drive.mesh_torque)(motion.x, motion.v, -self._mesh_mobility * torque)
+        moving = theta_l, omega_l, torque / self._load_inertia, slope / self._load_inertia
+        return taylor(moving, ahead), taylor(moving[1:], ahead)
 
     def _torque_as_read(self, state: State, inputs: Inputs | None) -> Array:
         """The mesh torque when its sensor is read: Taylor's series to the fourth order in the delay. The first order is
@@ -317,25 +315,13 @@ class TwoInertiaModel(Model):
             motion = self.motion(state, conditions)
             return motion.x, motion.v
 
-        # The twist and its derivatives by time, and by them those of the bare drive's torque.
         (x, v), (_, acceleration) = jax.jvp(twist, tuple(state), tuple(rates))
-        jerk = -self._mesh_mobility * first
-
-        def bare_first(x: Array, v: Array, acceleration: Array) -> Array:
-            return jax.jvp(self.drive.mesh_torque, (x, v), (v, acceleration))[1]
-
-        def bare_second(x: Array, v: Array, acceleration: Array, jerk: Array) -> Array:
-            return jax.jvp(bare_first, (x, v, acceleration), (v, acceleration, jerk))[1]
-
-        def bare_third(x: Array, v: Array, acceleration: Array, jerk: Array, snap: Array) -> Array:
-            return jax.jvp(bare_second, (x, v, acceleration, jerk), (v, acceleration, jerk, snap))[1]
-
-        second = bare_second(x, v, acceleration, jerk)
-        snap = -self._mesh_mobility * second
-        third = bare_third(x, v, acceleration, jerk, snap)
-        twist_and_rates = x, v, acceleration, jerk, snap
-        fourth = jax.jvp(bare_third, twist_and_rates, (*twist_and_rates[1:], -self._mesh_mobility * third))[1]
-        return now + ahead * (first + ahead * (second / 2.0 + ahead * (third / 6.0 + ahead * fourth / 24.0)))
+        series, moving, derivative = [now, first], [x, v, acceleration], time_derivative(self.drive.mesh_torque)
+        for _ in range(3):
+            moving.append(-self._mesh_mobility * series[-1])
+            derivative = time_derivative(derivative)
+            series.append(derivative(*moving))
+        return taylor(series, ahead)
 
     @property
     def _mesh_mobility(self) -> Array:
