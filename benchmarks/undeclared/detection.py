@@ -3,18 +3,21 @@
 The logs are cut into segments of six natural periods, as a fit would. Each is simulated without the effect from its
 true state under the torque that was commanded. What then differs in the two encoders' readings, less what other base
 parameters (K, K alpha, B_sp, one set for all logs) and other initial states (for each segment) would absorb, is the
-effect's trace. Its norm in units of the encoders' noise, sqrt(sum (trace / sigma)^2), is the distance d
-between "with" and "without" that the best possible test has. Of it the held-out fifth of the data sees d sqrt(0.2).
+effect's trace. Its norm in units of the encoders' noise, sqrt(trace' C^-1 trace) with the noise's covariance C, is the
+distance d between "with" and "without" that the best possible test has. Of it the held-out fifth of the data sees
+d sqrt(0.2).
 
 At the limit that is 5.5: 3.9 for an error of the first kind of 1e-4 (one percent over about a hundred forms and shapes)
-and 1.6 for finding it in 95 of 100 cases. Coloured noise enters by its rms.
+and 1.6 for finding it in 95 of 100 cases.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from undeclared.mechanism import Mechanism
+from undeclared.noise import Encoders
 
 LIMIT = 5.5
 _HELD_OUT = 0.2
@@ -31,7 +34,7 @@ def detectability(
     base: Mechanism,
     logs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
     *,
-    sigma: tuple[float, float],
+    encoders: Encoders,
     dt: float,
 ) -> float:
     """Strength of what is hidden in units of the detection limit.
@@ -40,17 +43,18 @@ def detectability(
         base: the drive without it.
         logs: for each, the true states (samples, at least 4), what noiseless encoders read (samples, 2), motor torque
             and load torque.
-        sigma: rms noise of motor and load encoder [rad].
+        encoders: with their noise.
         dt: sampling interval [s].
     """
     length = int(round(_PERIODS * 2 * np.pi / base.omega_0 / dt))
     substeps = max(1, int(np.ceil(_STEPS_A_PERIOD * dt * base.omega_0 / (2 * np.pi))))
     starts = [np.arange(0, len(torque) - length, length) for _, _, torque, _ in logs]
+    factors = np.linalg.cholesky(encoders.covariances(length))
     states = [own[first, :4] for (own, *_), first in zip(logs, starts, strict=True)]
     least = np.inf
     for _ in range(_PASSES):
         seen = [
-            _trace(base, own, log, first[:, None] + np.arange(length), sigma, dt, substeps)
+            _trace(base, own, log, first[:, None] + np.arange(length), factors, dt, substeps)
             for log, first, own in zip(logs, starts, states, strict=True)
         ]
         # A step too far ends in a simulation that diverges.
@@ -69,7 +73,7 @@ def _trace(
     states: np.ndarray,
     log: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     window: np.ndarray,
-    sigma: tuple[float, float],
+    factors: np.ndarray,
     dt: float,
     substeps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -80,8 +84,8 @@ def _trace(
     with np.errstate(all="ignore"):
         runs = [_segments(p, y, torque[window], brake[window], dt, substeps) for p, y, _ in variants]
         moves = [(run - runs[0]) / size for run, (_, _, size) in zip(runs[1:], variants[1:], strict=True)]
-        slopes = np.stack([_white(move, sigma) for move in moves], axis=-1)
-    return _white(readings[window] - runs[0], sigma), slopes
+        slopes = np.stack([_white(move, factors) for move in moves], axis=-1)
+    return _white(readings[window] - runs[0], factors), slopes
 
 
 def _absorbed(seen: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float]:
@@ -111,9 +115,10 @@ def _moved(
     return base._replace(k1=k1, k3=k3, c1=c1), moved
 
 
-def _white(readings: np.ndarray, sigma: tuple[float, float]) -> np.ndarray:
-    """Both readings of a segment in one row, in units of their noise."""
-    return (readings / np.asarray(sigma)).reshape(len(readings), -1)
+def _white(readings: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Both readings of a segment in one row, with their noise made white, from Cholesky factors of its covariance."""
+    both = [solve_triangular(own, readings[..., i].T, lower=True).T for i, own in enumerate(factors)]
+    return np.concatenate(both, axis=1)
 
 
 def _variants(base: Mechanism, states: np.ndarray) -> list[tuple[Mechanism, np.ndarray, float]]:

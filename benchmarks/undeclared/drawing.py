@@ -270,7 +270,7 @@ class _Bench:
         if not all(np.isfinite(run.states).all() for run in runs):
             return np.inf
         logs = [(run.states, run.readings, run.torque, run.excitation.brake) for run in runs]
-        return detectability(self.base, logs, sigma=self.encoders.rms, dt=self.dt)
+        return detectability(self.base, logs, encoders=self.encoders, dt=self.dt)
 
     def temperatures(self, random: np.random.Generator) -> list[np.ndarray]:
         """Kelvin above the reference in each log: a start and an exponential drift; zero where nothing heats."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 
@@ -27,6 +28,15 @@ class Encoders:
         """Rms of noise and quantisation."""
         motor, load = (float(np.hypot(n, s / np.sqrt(12))) for n, s in zip(self.noise, self.step, strict=True))
         return motor, load
+
+    def covariances(self, count: int) -> np.ndarray:
+        """Covariance of the noise and quantisation of samples in succession, of each encoder (2, count, count)."""
+        coloured = (1 - self.white) * self.memory ** np.arange(count) if self.memory else np.zeros(count)
+        coloured[0] = 1.0
+        alone = np.arange(count) == 0
+        return np.stack(
+            [toeplitz(n**2 * coloured + s**2 / 12 * alone) for n, s in zip(self.noise, self.step, strict=True)]
+        )
 
     def read(self, readings: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Recorded readings (samples, 2) of noiseless ones."""

@@ -33,6 +33,7 @@ from fitting.first_order.linearised_fit import motion_states
 from fitting.first_order.motion import place_of, unit_reading
 from fitting.first_order.surrogates import chance_of_gain
 from hdjax import Model, sampled
+from hdjax.dynamics import Inputs
 from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import Learned, LearnedReading
 from hdjax.parameters import as_scalar
@@ -207,9 +208,21 @@ def _done(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " 
         return _torques(model, found, fit)
     unit = np.asarray(unit_reading(model, found.chosen.form))
     bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
-    states = jnp.asarray(found.states)
-    added = np.asarray(jax.vmap(model.outputs)(states) - jax.vmap(bare.outputs)(states))
-    return added @ unit / (unit @ unit)
+    states = _own_motion(model, found, fit), jnp.asarray(found.states)
+    own, others = (_readings(of, along, found.conditions) for of, along in zip((model, bare), states, strict=True))
+    return np.asarray(own - others) @ unit / (unit @ unit)
+
+
+def _readings(
+    model: Model, states: Float[Array, "instants states"], conditions: Conditions
+) -> Float[Array, "instants outputs"]:
+    """Outputs of a model at instants without a load torque."""
+
+    def read(state: Array, at: Conditions) -> Array:
+        nothing = jnp.zeros(())
+        return model.outputs(state, Inputs(nothing if at.T_m is None else at.T_m, nothing, at))
+
+    return jax.vmap(read)(states, conditions)
 
 
 def _torques(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " instants"]:

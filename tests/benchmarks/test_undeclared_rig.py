@@ -1,6 +1,7 @@
 """The simulated rig of the study against scipy, closed forms and the energy balance, and the logs of its cases."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -251,27 +252,38 @@ def test_solver_steps_are_fine_enough_for_nonsmooth_effects(form: Form):
     assert np.sqrt(np.mean((first - second) ** 2)) < 1e-7
 
 
-def detectability_of(p: Mechanism, sigma: tuple[float, float] = (1e-5, 1e-6)) -> float:
+WHITE = Encoders((1e-5, 1e-6), (0.0, 0.0), 0.0)
+
+
+def detectability_of(p: Mechanism, encoders: Encoders = WHITE) -> float:
     torque = np.repeat(random_torque(400), 5)
     states, _ = integrate(p, np.zeros(4), torque, dt=DT, substeps=20)
     readings = np.column_stack(read_encoders(p, states))
-    return detectability(BASE, [(states, readings, torque, np.zeros(2000))], sigma=sigma, dt=DT)
+    return detectability(BASE, [(states, readings, torque, np.zeros(2000))], encoders=encoders, dt=DT)
 
 
 def test_detectability_measures_the_residual_after_a_refit():
     one = detectability_of(BASE._replace(bias=0.01))
     assert one > 1.0
     assert detectability_of(BASE._replace(bias=0.02)) == pytest.approx(2 * one, rel=0.05)
-    assert detectability_of(BASE._replace(bias=0.01), sigma=(2e-5, 2e-6)) == pytest.approx(one / 2, rel=1e-3)
+    twice = replace(WHITE, noise=(2e-5, 2e-6))
+    assert detectability_of(BASE._replace(bias=0.01), twice) == pytest.approx(one / 2, rel=1e-3)
     # Changes of stiffness or damping alone are not detectable as an effect.
     assert detectability_of(BASE) < 1e-2
     assert detectability_of(BASE._replace(k1=7007.0, c1=0.303)) < 0.05
-    # One wrong sample of one encoder: a fifth of its squared error counts.
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.6])
+def test_detectability_of_one_wrong_sample_agrees_with_the_closed_form(memory: float):
+    """The inverse covariance of a first-order autoregression is tridiagonal."""
     states, _ = integrate(BASE, np.zeros(4), random_torque(400), dt=DT, substeps=20)
     readings = np.column_stack(read_encoders(BASE, states))
     readings[100, 1] += 1e-4
-    found = detectability(BASE, [(states, readings, random_torque(400), np.zeros(400))], sigma=(1e-5, 1e-6), dt=DT)
-    assert found == pytest.approx(100 * np.sqrt(0.2) / LIMIT, rel=0.05)
+    encoders = replace(WHITE, memory=memory, white=0.0)
+    found = detectability(BASE, [(states, readings, random_torque(400), np.zeros(400))], encoders=encoders, dt=DT)
+    # A fifth of the squared error counts.
+    distance = 100 * np.sqrt((1 + memory**2) / (1 - memory**2))
+    assert found == pytest.approx(distance * np.sqrt(0.2) / LIMIT, rel=0.05)
 
 
 def test_encoder_noise_has_its_rms_and_colour():
