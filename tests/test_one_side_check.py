@@ -1,6 +1,7 @@
 """Where one side's own equation leaves only noise, it supplies K, alpha and B_sp of a final model that leaves more."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -21,13 +22,24 @@ from fitting.uncertainty.standard_errors import uncertainty
 from fitting.validation.account import of_parameters
 from hdjax import Drive, TwoInertiaModel
 from hdjax.drive import Prior
-from hdjax.effects import ViscousMotorFriction
+from hdjax.effects import CATALOGUE, Effect, ViscousMotorFriction
+from hdjax.effects.actuation import TorqueGain
+from hdjax.effects.friction import LoadFriction, MotorFriction, StribeckMotorFriction
+from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.load import ConstantLoad, GravityLoad
 
 SMOOTH = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
 RUBBING = {
     "load equation": joints.with_friction(SMOOTH, 0.3, 0.2),
     "motor equation": dataclasses.replace(SMOOTH, load_friction=0.4 * SMOOTH.rms * SMOOTH.N, bend=3e-3),
 }
+
+
+# Friction of either side, gravity, and the forms that are most similar to them.
+SOME_FORMS = (
+    *(MotorFriction, StribeckMotorFriction, LoadFriction),
+    *(GravityLoad, ConstantLoad, KinematicError, TorqueGain),
+)
 
 
 def stretches_of(joint: joints.Joint) -> tuple[Stretch, ...]:
@@ -99,12 +111,13 @@ def test_side_driven_by_late_readings_supplies_nothing():
         assert abs(known[path].value - true) < 4.0 * known[path].std, (path, known[path])
 
 
-def test_loop_finds_gravity_behind_the_friction_of_the_motor():
+@pytest.mark.parametrize("catalogue", [SOME_FORMS, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["few", "all"])
+def test_loop_finds_gravity_behind_the_friction_of_the_motor(catalogue: Sequence[type[Effect]]):
     """An inexact law of the motor's friction may leave as much, but not in the load's own equation."""
     joint = dataclasses.replace(RUBBING["load equation"], gravity=0.02 * SMOOTH.K)
     experiment = experiment_from_log(joints.log_of(joint, count=3000), hold="zero-order", N=joint.N)
     model = TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=1.0))
-    report = report_dict(close_loop(model, {"zero-order": (experiment,)}, hold="zero-order"))
+    report = report_dict(close_loop(model, {"zero-order": (experiment,)}, hold="zero-order", catalogue=catalogue))
     assert report["decision"] == "effect_found"
     assert {e["family"] for e in report["after"]["effects"]} == {"motor_friction", "gravity_load"}
     low, high = report["after"]["parameters"]["K"]["ci95"]
