@@ -36,15 +36,15 @@ State = Literal["fitted", "refused", "failed"]
 Row = dict[str, Any]
 # A drive file beside a log takes precedence over the common one.
 _OWN_DRIVE = "drive.toml"
-_FINISHED = "finished"
+_FINISHED, _TABLE = "finished", "fleet.parquet"
 
 
-def find_logs(folder: Path, *, apart_from: Path | None = None) -> tuple[Path, ...]:
+def find_logs(folder: Path, *, apart_from: Path) -> tuple[Path, ...]:
     """The log files below a folder, in order of their names, without hidden files and folders.
 
     Args:
         folder: to search.
-        apart_from: the folder of the results, which is skipped.
+        apart_from: a file or folder of results, which is skipped.
 
     Raises:
         InputError: there is none.
@@ -52,7 +52,7 @@ def find_logs(folder: Path, *, apart_from: Path | None = None) -> tuple[Path, ..
     found = []
     for path in sorted(folder.rglob("*")):
         inside = path.relative_to(folder).parts
-        if apart_from is not None and path.resolve().is_relative_to(apart_from.resolve()):
+        if path.resolve().is_relative_to(apart_from.resolve()):
             continue
         if path.is_file() and path.suffix.lower() in LOG_SUFFIXES and not any(p.startswith(".") for p in inside):
             found.append(path)
@@ -88,7 +88,7 @@ def fit_fleet(
     Raises:
         InputError: there are no logs, or no cluster.
     """
-    logs = find_logs(folder, apart_from=out)
+    logs = find_logs(folder, apart_from=out / _TABLE)
     given = folder.absolute(), drive.absolute(), out.absolute()
     absolute = {log.absolute(): log for log in logs}
     if workers or scheduler:
@@ -105,7 +105,7 @@ def fit_fleet(
     table = pl.DataFrame([rows[log] for log in logs], infer_schema_length=None)
     buffer = BytesIO()
     table.write_parquet(buffer)
-    write_whole({out / "fleet.parquet": buffer.getvalue()})
+    write_whole({out / _TABLE: buffer.getvalue()})
     return table
 
 
@@ -139,7 +139,9 @@ def _finished_row(folder: Path, drive: Path, out: Path, log: Path) -> Row:
             # Corrupt file: computed again below.
             pass
     row = _fit_one(log, name, drive)
-    write_whole({kept: json.dumps(row, allow_nan=False)})
+    # What was refused may be accepted once a package is installed.
+    if row["state"] == "fitted":
+        write_whole({kept: json.dumps(row, allow_nan=False)})
     return row
 
 
@@ -150,12 +152,13 @@ def _fit_one(log: Path, name: str, drive: Path) -> Row:
         # Fits run in parallel, so each uses one device.
         with jax.default_device(jax.local_devices()[0]), one_thread():
             fitted = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold)
+        figures = _figures(rig, fitted)
     except (InputError, DataError, SimulationError) as error:
         return _row(name, drive, "refused", str(error), seconds=time.perf_counter() - begin)
     except Exception as error:  # a failing log must not stop the others
         reason = f"{log}: the fit failed ({type(error).__name__}: {error}); please report this with the log"
         return _row(name, drive, "failed", reason, seconds=time.perf_counter() - begin)
-    return _row(name, drive, "fitted", "", seconds=time.perf_counter() - begin, **_figures(rig, fitted))
+    return _row(name, drive, "fitted", "", seconds=time.perf_counter() - begin, **figures)
 
 
 def _row(name: str, drive: Path, state: State, message: str, **figures: object) -> Row:
@@ -176,7 +179,7 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
         "rmse_training": account.rmse["training"],
         "rmse_test": account.rmse.get("test"),
         "noise": float(fitted.noise[-1, -1]) ** 0.5,
-        "error_over_noise": goodness.error_over_noise["dynamic error"],
+        "error_over_noise": list(goodness.error_over_noise.values())[-1],
         "fit_percent_test": goodness.fit_percent.get("test"),
     }
     return found | parameter_columns(account, log.units)

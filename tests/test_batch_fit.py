@@ -8,7 +8,7 @@ import pytest
 
 import fitting.batch_fit
 import rig
-from fitting.batch_fit import find_logs, fit_fleet, fleet_text, parameter_columns
+from fitting.batch_fit import Row, find_logs, fit_fleet, fleet_text, parameter_columns
 from fitting.errors import DataError, InputError
 from fitting.uncertainty.identifiability import Identifiability
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
@@ -37,14 +37,14 @@ def drive(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def attempted_logs(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The logs for which a fit was attempted; each attempt is refused."""
+    """The logs of which a fit was attempted; all succeed at once."""
     seen: list[Path] = []
 
-    def refuse(logs: list[Path], drive: Path, **how: bool):
-        seen.extend(logs)
-        raise DataError(f"{logs[0]}: no")
+    def fit(log: Path, name: str, drive: Path) -> Row:
+        seen.append(log)
+        return {"log": name, "drive": str(drive), "state": "fitted", "message": ""}
 
-    monkeypatch.setattr(fitting.batch_fit, "read_rig", refuse)
+    monkeypatch.setattr(fitting.batch_fit, "_fit_one", fit)
     return seen
 
 
@@ -92,13 +92,13 @@ def test_interrupted_run_is_resumed(tmp_path: Path, drive: Path, monkeypatch: py
     seen: list[Path] = []
     limit = 2
 
-    def read(paths: list[Path], drive: Path, **how: bool):
+    def fit(log: Path, name: str, drive: Path) -> Row:
         if len(seen) == limit:
             raise KeyboardInterrupt
-        seen.extend(paths)
-        raise DataError(f"{paths[0]}: no")
+        seen.append(log)
+        return {"log": name, "drive": str(drive), "state": "fitted", "message": ""}
 
-    monkeypatch.setattr(fitting.batch_fit, "read_rig", read)
+    monkeypatch.setattr(fitting.batch_fit, "_fit_one", fit)
     # One log at a time.
     monkeypatch.setattr(fitting.batch_fit.os, "cpu_count", lambda: 1)
     with pytest.raises(KeyboardInterrupt):
@@ -108,6 +108,21 @@ def test_interrupted_run_is_resumed(tmp_path: Path, drive: Path, monkeypatch: py
     table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     assert seen == logs
     assert len(table) == 4
+
+
+def test_refused_log_is_tried_again(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+    """It may be accepted once a missing package is installed."""
+    write_log(tmp_path / "logs" / "0.csv")
+
+    def refuse(logs: list[Path], drive: Path, **how: bool):
+        raise InputError(f"{logs[0]}: install it")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fitting.batch_fit, "read_rig", refuse)
+        assert fit_fleet(tmp_path / "logs", drive, tmp_path / "out")["state"].to_list() == ["refused"]
+    # The results may be in the folder of the logs.
+    for _ in range(2):
+        assert fit_fleet(tmp_path / "logs", drive, tmp_path / "logs")["state"].to_list() == ["fitted"]
 
 
 def test_exception_in_one_fit_does_not_stop_the_others(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
@@ -159,7 +174,7 @@ def test_log_files_of_a_folder_are_found(tmp_path: Path):
     assert [p.name for p in find_logs(tmp_path, apart_from=tmp_path / "out")] == ["a.parquet", "b.CSV"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no log files"):
-        find_logs(tmp_path / "empty")
+        find_logs(tmp_path / "empty", apart_from=tmp_path / "out")
 
 
 def test_unidentifiable_parameter_has_its_reason_in_the_table():

@@ -1,7 +1,7 @@
 """Free runs of identified models along logs, and comparison of models."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,13 @@ from fitting.api.data import Data
 from fitting.api.results import Result
 from fitting.drive_data import WHY_NOT_QUASI_STATIC, experiments
 from fitting.errors import DataError, InputError
-from fitting.estimation.experiment import Stretch, fitted_outputs
+from fitting.estimation.experiment import fitted_outputs, whole
 from fitting.estimation.free_run import WINDOW, FreeRun, as_logged, free_run
 from fitting.files import write_whole
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
+from fitting.logs.masks import masked
+from fitting.logs.zeroing import counted_from
 from fitting.report.plots.axes import MEASURED
 from fitting.stored_model import StoredModel, read_model
 from fitting.validation.goodness_of_fit import fit_percent
@@ -43,6 +45,11 @@ class Prediction:
     findings: tuple[Finding, ...]
 
     @property
+    def is_judged(self) -> bool:
+        """Whether outputs are known beyond those that the run starts from."""
+        return bool(self.run.counts[WINDOW:].any())
+
+    @property
     def table(self) -> pl.DataFrame:
         """Time [s] and predicted outputs [SI, or a reduced log's unit], the principal one first, one row per sample."""
         zeros = {"dynamic_error": self.zero}
@@ -59,7 +66,9 @@ class Prediction:
         return _drawn({"predicted": self.run}, axes)
 
     def summary(self) -> str:
-        """The error in a sentence."""
+        """The error in a sentence; where no output is known beyond the first ones, that."""
+        if not self.is_judged:
+            return f"{self.run.name}: {self.run.time.size} samples predicted, with no measured output to compare with"
         return f"{self.run.name}: rms error {self.run.rmse:.4g}, fit {fit_percent([self.run]):.4g} %"
 
     def _repr_html_(self) -> str:
@@ -104,7 +113,8 @@ class Comparison:
 def predict(model: AnyModel, data: Data) -> Prediction:
     """Run a model freely along a log.
 
-    The log's outputs are used in the first 50 samples only, for the initial state.
+    The log's outputs are used in the first 50 samples only, for the initial state. The others, where they were loaded,
+    are those that the prediction is compared with.
 
     Args:
         model: A `model.json` of a report, a result, or its model.
@@ -118,7 +128,10 @@ def predict(model: AnyModel, data: Data) -> Prediction:
         raise InputError(f"a prediction follows one log, but there are {len(data.logs)}; load it alone")
     stored, name = _stored(model)
     log = data.ready(data.logs[0], outputs_until=WINDOW)
-    (run,), rows = _runs(stored, name, data, log)
+    known = log
+    if data.outputs_until is None:
+        known = replace(counted_from(masked(data.logs[0]), log.zero), pieces=None)
+    (run,), rows = _runs(stored, name, data, log, judged=known)
     if not np.isfinite(run.predicted).all():
         raise DataError(f"{log.path}: the model's free run diverges; check the torque column's unit and sign")
     return Prediction(run, rows, log.zero, log.findings)
@@ -149,7 +162,8 @@ def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:
 
     place = plt.subplots()[1] if axes is None else axes
     first = next(iter(runs.values()))
-    place.plot(first.time, first.measured, color=MEASURED, linewidth=3.0, label="measured")
+    measured = np.where(first.counts, first.measured, np.nan)
+    place.plot(first.time, measured, color=MEASURED, linewidth=3.0, label="measured")
     for name, run in runs.items():
         place.plot(run.time, run.predicted, linewidth=1.2, label=name)
     place.set(xlabel="time [s]", ylabel=first.output.replace("_", " "), title=first.name)
@@ -168,7 +182,10 @@ def _stored(model: AnyModel) -> tuple[StoredModel, str]:
     return read_model(Path(model)), str(model)
 
 
-def _runs(stored: StoredModel, name: str, data: Data, log: Log) -> tuple[tuple[FreeRun, ...], np.ndarray | slice]:
+def _runs(
+    stored: StoredModel, name: str, data: Data, log: Log, *, judged: Log | None = None
+) -> tuple[tuple[FreeRun, ...], np.ndarray | slice]:
+    """Free runs along a log, compared with its outputs or with those of another reading of it; and their rows."""
     if log.kind == "quasi-static":
         raise InputError(f"{log.path}: {WHY_NOT_QUASI_STATIC}")
     if (log.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
@@ -187,13 +204,8 @@ def _runs(stored: StoredModel, name: str, data: Data, log: Log) -> tuple[tuple[F
             f"{log.path}: there is no temperature, on which {warm[0]} of {name} depends; add the column, or name it in "
             f"[columns] temperature of {data.drive.path}"
         )
-    ready = experiments(log, data.drive, stored.hold)
-    runs = free_run(
-        stored.model,
-        [Stretch(part, 0, len(part)) for part in ready],
-        covariance=stored.noise,
-        halo=stored.halo,
-        substeps=stored.substeps,
-    )
-    rows = ready[0].rows
+    along, known = (whole(experiments(one, data.drive, stored.hold)) for one in (log, judged or log))
+    how = {"covariance": stored.noise, "halo": stored.halo, "substeps": stored.substeps}
+    runs = free_run(stored.model, along, judged=known, **how)
+    rows = along[0].experiment.rows
     return runs, slice(None) if rows is None else rows

@@ -118,6 +118,7 @@ def free_run(
     halo: int = 0,
     substeps: int | None = None,
     like: Fit | None = None,
+    judged: Sequence[Stretch] | None = None,
 ) -> tuple[FreeRun, ...]:
     """Simulate each stretch from its first [`WINDOW`][] samples on.
 
@@ -128,10 +129,11 @@ def free_run(
         halo: intervals of torque before the start, for delays.
         substeps: solver steps in a sample interval.
         like: a fit of the same model, whose compiled program is reused.
+        judged: the same stretches with the outputs that the runs are compared with; those to simulate if None.
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    logged = [replace(s, experiment=moved_to(s.experiment, Moved())) for s in stretches]
+    logged = [replace(s, experiment=moved_to(s.experiment, Moved())) for s in judged or stretches]
     model, stretches = aligned(model, stretches)
     starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))

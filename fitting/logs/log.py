@@ -161,7 +161,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     raw = {s: table.columns[c] for s in SIGNALS if (c := drive_file.column_of(s).column) in table.columns}
     refuse_repeated(path, drive_file, table)
     kind = kind_of(path, drive_file, table, raw)
-    required = needed_signals(kind, raw)
+    required = needed_signals(kind, raw, drive_file)
     joined = (*joined, *(told_of_subset(path, drive_file, table, raw) if kind == "drive" else ()))
     raw, start, stop, told = _inhabited(path, drive_file, table, raw, required)
     asked, outputs_until = outputs_until, _rows_until(outputs_until, raw, required[:-1], start)

@@ -12,7 +12,8 @@ from fitting.logs.raw_table import RawColumn, RawTable, split_unit
 
 DRIVE_SIGNALS = ("motor_angle", "load_angle", "motor_torque")
 REDUCED_SIGNALS = ("dynamic_error", "forcing")
-TWIST_SIGNALS = (("twist",), ("dynamic_error",), ("motor_angle", "load_angle"), ("load_angle",))
+_BOTH_ANGLES = ("motor_angle", "load_angle")
+TWIST_SIGNALS = (("twist",), ("dynamic_error",), _BOTH_ANGLES, ("load_angle",))
 OUTPUTS = ("motor_angle", "load_angle", "dynamic_error", "twist", "motor_velocity", "load_velocity")
 OPTIONAL_SIGNALS = ("load_torque", "temperature")
 VELOCITIES = ("motor_velocity", "load_velocity")
@@ -52,7 +53,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
     if has_angles and is_reduced:
         # A drive log may contain a derived dynamic error; only a stated one replaces the angles.
         has_angles = not all(signal in stated for signal in REDUCED_SIGNALS)
-    if "joint_torque" in raw and twist_signals(raw):
+    if "joint_torque" in raw and twist_signals(raw, drive_file):
         only_stated = "joint_torque" in stated and not ("motor_torque" in stated or "forcing" in stated)
         if only_stated or not (has_angles or is_reduced or "motor_torque" in stated):
             return "quasi-static"
@@ -117,10 +118,10 @@ def listing(table: RawTable) -> str:
     return f"the file has {', '.join(name[:60] for name in table.names[:12])}{more}"
 
 
-def needed_signals(kind: Kind, raw: Mapping[str, RawColumn]) -> tuple[str, ...]:
+def needed_signals(kind: Kind, raw: Mapping[str, RawColumn], drive_file: DriveFile) -> tuple[str, ...]:
     """The signals of a log, its input last."""
     if kind == "quasi-static":
-        return (*twist_signals(raw), "joint_torque")
+        return (*twist_signals(raw, drive_file), "joint_torque")
     return (*drive_outputs(raw), "motor_torque") if kind == "drive" else REDUCED_SIGNALS
 
 
@@ -141,6 +142,13 @@ def drive_outputs(signals: Collection[str]) -> tuple[str, ...]:
     return (*(s for s in sides if s is not None), *(s for s in ("joint_torque",) if s in signals))
 
 
-def twist_signals(raw: Mapping[str, RawColumn]) -> tuple[str, ...]:
-    """Signals that give the twist of a quasi-static log; empty where they are missing."""
-    return next((signals for signals in TWIST_SIGNALS if all(s in raw for s in signals)), ())
+def twist_signals(raw: Mapping[str, RawColumn], drive_file: DriveFile) -> tuple[str, ...]:
+    """Signals that give the twist of a quasi-static log; empty where they are missing.
+
+    Both angles also tell how the joint moved. Beside them only a stated twist counts.
+    """
+    found = [signals for signals in TWIST_SIGNALS if all(s in raw for s in signals)]
+    stated = any(s in drive_file.columns for s in ("twist", "dynamic_error"))
+    if _BOTH_ANGLES in found and drive_file.states("reduction_ratio") and not stated:
+        return _BOTH_ANGLES
+    return found[0] if found else ()

@@ -17,7 +17,6 @@ from fitting.next_experiment.discrimination import (
     Refit,
     Response,
     Signals,
-    in_own_units,
     refit,
     respond,
     signals,
@@ -167,7 +166,7 @@ def largest_twist(of: Explanation, starts: Sequence[Excitation], bench: Bench) -
     """The largest dynamic error of an explanation under any of the commands [rad]."""
     stages = (_stage([of], excitation, bench, False) for excitation in starts)
     own = (evaluate(s, s.excitation.coefficients).own[0] for s in stages)
-    return max(float(np.max(np.abs(in_own_units(r.outputs, bench)[:, -1]))) for r in own)
+    return max(float(np.max(np.abs(r.twist))) for r in own)
 
 
 def _stage(explanations: Sequence[Explanation], excitation: Excitation, bench: Bench, both_ways: bool) -> _Stage:

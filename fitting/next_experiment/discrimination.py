@@ -101,6 +101,7 @@ class Response(eqx.Module):
         motion: motor speed and the output's travel (two-inertia model only), then the dynamic error; in units of the
             limits.
         motion_by_command: its derivative by the command's coefficients.
+        twist: the dynamic error [rad].
     """
 
     outputs: Float[np.ndarray, " rows"]
@@ -108,6 +109,7 @@ class Response(eqx.Module):
     by_command: Float[np.ndarray, "rows shapes"]
     motion: Float[np.ndarray, "samples quantities"]
     motion_by_command: Float[np.ndarray, "samples quantities shapes"]
+    twist: Float[np.ndarray, " samples"]
 
     @property
     def usable(self) -> bool:
@@ -177,11 +179,10 @@ def respond(
         rest[0], rest[1] = bench.motor_angle, bench.motor_angle / float(model.drive.N)
     warm = any(e.needs_temperature for e in model.effects)
     limits = bench.limits
-    units = [limits.speed, limits.travel * float(model.drive.N)] if drive else []
+    units = np.array([*([limits.speed, limits.travel * float(model.drive.N)] if drive else []), limits.twist])
     setup = _Setup(
         rest=jnp.asarray(rest),
         white=jnp.asarray(whitening(bench.noise)),
-        units=jnp.asarray(np.array([*units, limits.twist])),
         temperature=jnp.asarray(np.asarray(bench.temperature if warm and bench.temperature is not None else 0.0)),
         substeps=jnp.asarray(np.asarray(bench.substeps)),
         halo=bench.halo,
@@ -192,8 +193,9 @@ def respond(
         outputs.ravel(),
         columns[..., : unknowns.size].reshape(outputs.size, -1),
         columns[..., unknowns.size :].reshape(outputs.size, -1),
-        motion,
-        motion_columns[..., unknowns.size :],
+        motion / units,
+        motion_columns[..., unknowns.size :] / units[:, None],
+        motion[:, -1],
     )
 
 
@@ -203,7 +205,6 @@ class _Setup(eqx.Module):
     Attributes:
         rest: motion state at the start.
         white: whitening of the outputs.
-        units: of the limited quantities.
         temperature: of the drive [K].
         substeps: solver steps in a sample interval.
         halo: intervals of zero torque before the start.
@@ -211,7 +212,6 @@ class _Setup(eqx.Module):
 
     rest: Array
     white: Array
-    units: Array
     temperature: Array
     substeps: Array
     halo: int = eqx.field(static=True)
@@ -233,8 +233,10 @@ def _respond(
         state = drive.settled(setup.rest + entries[own : own + motions])
         states, _ = march(drive, acting, None, state, solver=dfx.Tsit5(), substeps=setup.substeps, temperature=warmth)
         outputs = read(drive, jnp.asarray(acting.knots)[:-1], states, acting, None, warmth)
-        moved = [states[:, 2], states[:, 0] - setup.rest[0]] if setup.units.size > 1 else []
-        return outputs @ setup.white.T, jnp.stack([*moved, outputs[:, -1]], axis=1) / setup.units[None, :]
+        moved = [states[:, 0]]
+        if isinstance(drive, TwoInertiaModel):
+            moved = [states[:, 2], states[:, 0] - setup.rest[0], states[:, 0] / drive.drive.N - states[:, 1]]
+        return outputs @ setup.white.T, jnp.stack(moved, axis=1)
 
     def along(tangent: Array):
         return jax.jvp(simulated, (at,), (tangent,))

@@ -67,16 +67,17 @@ class Excitation(eqx.Module):
         return self.torque * self.shapes @ coefficients
 
 
-def reached(stretches: Sequence[Stretch], *, most_samples: int) -> Limits:
+def reached(model: Model, stretches: Sequence[Stretch], *, most_samples: int) -> Limits:
     """The largest values in the logs, as limits.
 
     Args:
+        model: supplies the reduction ratio.
         stretches: of the logs.
         most_samples: longest command.
     """
     first = stretches[0].experiment
     step = first.time_step
-    torque, speed, travel = 0.0, 0.0, 0.0
+    torque, speed, turned = 0.0, 0.0, 0.0
     for stretch in stretches:
         part = slice(stretch.start, stretch.stop)
         torque = max(torque, float(np.max(np.abs(np.asarray(stretch.experiment.torque.coefficients)[part, 0]))))
@@ -85,8 +86,9 @@ def reached(stretches: Sequence[Stretch], *, most_samples: int) -> Limits:
             angle = motor[part]
             span = min(_SPEED_SPAN, len(angle) - 1)
             speed = max(speed, float(np.max(np.abs(angle[span:] - angle[:-span]))) / (span * step))
-            travel = max(travel, float(np.max(np.abs(stretch.experiment.measured[part, 0] - first.measured[0, 0]))))
+            turned = max(turned, float(np.max(np.abs(angle - np.asarray(first.motor_angle)[0]))))
     longest = max(len(s) for s in stretches)
+    travel = turned / float(model.drive.N) if isinstance(model, TwoInertiaModel) else np.inf
     free = first.motor_angle is None
     return Limits(
         torque=torque,

@@ -159,7 +159,7 @@ def experiment_for_ties(
     if not smooth:
         return None
     # The logs may separate all rivals, though short segments of the loop did not; then all are kept.
-    open_ones = [k for k in smooth if not _is_decided(told[k])] or smooth
+    open_ones = [k for k in smooth if not is_decided(told[k])] or smooth
     best = search([found, *(rivals[k] for k in open_ones)], starts, bench, progress=progress)
     if best is None:
         return None
@@ -175,7 +175,7 @@ def experiment_for_ties(
     return _proposal(best, bench, found, separations=tuple(made))
 
 
-def _is_decided(ratios: tuple[float, float] | None) -> bool:
+def is_decided(ratios: tuple[float, float] | None) -> bool:
     """Whether simulations as long as the logs separate two explanations, whichever is right."""
     return ratios is not None and min(ratios) > _DECIDED
 
@@ -275,7 +275,7 @@ def _bench(
     return Bench(
         motor_angle=0.0 if motor is None else float(motor[stretches[0].start]),
         noise=noise,
-        limits=replace(reached(stretches, most_samples=_USUAL_SAMPLES), **(limits or {})),
+        limits=replace(reached(model, stretches, most_samples=_USUAL_SAMPLES), **(limits or {})),
         halo=halo,
         substeps=substeps,
         temperature=scales(stretches, model).temperature,
@@ -384,7 +384,7 @@ def _proposal(
         begins_like=best.excitation.name,
         found=found.name,
         motor_angle=bench.motor_angle,
-        dynamic_error=in_own_units(own.outputs, bench)[:, -1],
+        dynamic_error=own.twist,
         motor_speed=own.motion[:, 0] * bench.limits.speed if isinstance(found.model, TwoInertiaModel) else None,
         separations=separations,
         precision=precision,

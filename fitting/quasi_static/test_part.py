@@ -86,9 +86,12 @@ def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ())
         data = prepare(logs, drive_file, at_rest=True)
         alone = [prepare([log], drive_file, at_rest=True) for log in test]
         whole = [points_of(one.logs, one.motion, ratio) for one in alone]
-        tests = tuple(Unseen.of(points, LEAD * points.duration) for points in whole)
+        points = points_of(data.logs, data.motion, ratio)
+        for log, one in zip(test, whole, strict=True):
+            _refuse_lacking(log, one, points)
+        tests = tuple(Unseen.of(one, LEAD * one.duration) for one in whole)
         data = replace(data, findings=data.findings | {name: f for one in alone for name, f in one.findings.items()})
-        return Parted(data, points_of(data.logs, data.motion, ratio), tests)
+        return Parted(data, points, tests)
     try:
         data = prepare([log.rows(0, _border(log)) for log in logs], drive_file, at_rest=True)
         points = points_of(data.logs, data.motion, ratio)
@@ -99,6 +102,16 @@ def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ())
         pass
     data = prepare(logs, drive_file, at_rest=True)
     return Parted(data, points_of(data.logs, data.motion, ratio), ())
+
+
+def _refuse_lacking(log: Log, points: Points, fitted: Points) -> None:
+    """Refuse a log of test data without a signal that an effect may depend on."""
+    for signal in ("motor_angle", "load_angle", "temperature"):
+        if getattr(points, signal) is None and getattr(fitted, signal) is not None:
+            raise DataError(
+                f"{log.path}: the log of test data has no {signal}, on which effects found in the others may depend; "
+                "add the column, or leave it out of the others"
+            )
 
 
 def _end(log: Log, motion: Motion, ratio: float | None) -> Unseen:
@@ -129,7 +142,9 @@ def misfit_on(tests: Sequence[Unseen], model: TwistModel, fitted: Points) -> np.
 
 
 def _misfit(test: Unseen, model: TwistModel, fitted: Points) -> np.ndarray:
-    points = replace(test.points, reference=fitted)
+    # A joint that did not move has no direction.
+    direction = np.zeros_like(test.points.torque) if test.points.direction is None else test.points.direction
+    points = replace(test.points, reference=fitted, direction=direction)
     left = points.twist - model.coefficients[0] * (points.torque - points.centre)
     # A form that only has initial states of logs or rests predicts nothing for another log.
     lasting = [(form, shape) for form, shape in model.terms if form.size]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.next_experiment.proposal import NextExperiment, Precision, Separation
+from fitting.next_experiment.proposal import NextExperiment, Precision, Separation, is_decided
 from fitting.report.limits import in_words_of_log
 
 COMMAND_FILE = "next_experiment.csv"
@@ -109,7 +109,7 @@ def _both(ratios: tuple[float, float] | None) -> dict[str, float | None]:
 def _tie_says(found: str, separation: Separation) -> str:
     rival, logs, proposed = separation.rival, separation.on_logs, separation.proposed
     if proposed is None:
-        if logs is None:
+        if not is_decided(logs):
             return f"{rival} is not smooth enough for a gradient search: no command was searched against it."
         return (
             f"Simulations as long as the logs already separate {found} and {rival}, with expected log-likelihood "

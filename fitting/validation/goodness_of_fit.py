@@ -92,8 +92,9 @@ def fit_percent(runs: Sequence[FreeRun]) -> float:
 
     100 is perfect, 0 is no better than a constant.
     """
-    error = sum(float(np.sum((r.measured - r.predicted) ** 2)) for r in runs)
-    swing = sum(float(np.sum((r.measured - r.measured.mean()) ** 2)) for r in runs)
+    error = sum(float(np.sum(r.squared_error)) for r in runs)
+    seen = [r.measured[r.counts] for r in runs if r.counts.any()]
+    swing = sum(float(np.sum((y - y.mean()) ** 2)) for y in seen)
     if not math.isfinite(error) or swing <= 0:
         return -math.inf
     return 100.0 * (1.0 - math.sqrt(error / swing))

@@ -139,7 +139,14 @@ def test_prediction_uses_only_the_first_samples_of_the_outputs(loop_result: fitt
     known = fitting.predict(loop_result, fitting.load(unseen, drive=DRIVE))
     guessed = fitting.predict(loop_result, fitting.load(blank, drive=DRIVE, outputs_until=50))
     assert np.allclose(known.run.predicted, guessed.run.predicted, rtol=1e-9, atol=1e-15)
-    assert known.run.rmse < 5e-6
+    assert known.is_judged and known.run.rmse < 5e-6
+    assert not guessed.is_judged and "no measured output" in guessed.summary()
+    np.testing.assert_allclose(
+        known.run.measured[50:], (unseen["motor_angle"] / rig.N - unseen["load_angle"])[50:] - known.zero, atol=1e-12
+    )
+    late = unseen | {"load_angle": unseen["load_angle"] + 1e-3 * (np.arange(COUNT) >= 100)}
+    wrong = fitting.predict(loop_result, fitting.load(late, drive=DRIVE)).run
+    assert wrong.rmse == pytest.approx(1e-3 * np.sqrt(1 - 100 / COUNT), rel=0.02)
     folder = loop_result.save(tmp_path / "report")
     again = fitting.predict(folder / "model.json", fitting.load(unseen, drive=DRIVE))
     assert np.allclose(again.run.predicted, known.run.predicted, rtol=1e-6, atol=1e-12)

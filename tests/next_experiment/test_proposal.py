@@ -69,7 +69,7 @@ def proposal(rivals: tuple[Explanation, Explanation]) -> Candidate:
 def test_limits_are_the_largest_values_of_the_log():
     experiment = rig.drive_experiment(1000)
     training, _ = split([experiment])
-    found = reached(training, most_samples=600)
+    found = reached(rig.drive_model(), training, most_samples=600)
     motion = rig.drive_motion(rig.drive_torque(1000))[:800]
     assert found.torque == np.max(np.abs(rig.drive_torque(1000)[:800]))
     assert found.speed == pytest.approx(np.max(np.abs(motion[:, 2])), rel=0.1)
@@ -79,7 +79,7 @@ def test_limits_are_the_largest_values_of_the_log():
 
 def test_reduced_log_limits_only_the_forcing():
     stretch = Stretch(rig.reduced_experiment(300), 0, 300)
-    found = reached([stretch], most_samples=1000)
+    found = reached(rig.drive_model(), [stretch], most_samples=1000)
     assert np.isinf([found.speed, found.travel]).all()
     (first, *_) = excitations(found, rig.reduced_model(), logged=np.zeros(10))
     assert np.max(np.abs(first.command(first.coefficients))) == pytest.approx(0.98 * found.torque)
