@@ -130,16 +130,23 @@ def read_logs(
 
 
 def together(logs: Sequence[Log]) -> tuple[Log, ...]:
-    """Logs of one kind, with unique names.
+    """Logs of one kind with the same outputs, with unique names.
 
     Raises:
-        InputError: They are of several kinds.
+        InputError: They are of several kinds, or have different outputs.
     """
     kinds = sorted({log.kind for log in logs})
     if len(kinds) > 1:
         raise InputError(
             f"{logs[0].path} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them "
             "separately"
+        )
+    other = next((log for log in logs if kinds == ["drive"] and log.outputs != logs[0].outputs), None)
+    if other is not None:
+        one, two = (" and ".join(log.outputs) for log in (logs[0], other))
+        raise InputError(
+            f"{other.path}: it has {two} where {logs[0].path} has {one}, so that they can't be fitted together; run "
+            "them separately, or leave the others out of both"
         )
     return _with_own_names(logs)
 

@@ -12,6 +12,7 @@ from fitting.estimation.starting_values import sees_twist
 from fitting.uncertainty.one_side import contradicts, leaves_only_noise
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import OneSideModel, TwoInertiaModel
+from hdjax.effects import SensorEffect
 
 
 def better_side(found: Fit) -> Fit | None:
@@ -23,6 +24,9 @@ def better_side(found: Fit) -> Fit | None:
     """
     model = found.model
     if not isinstance(model, TwoInertiaModel) or not sees_twist(found.stretches):
+        return None
+    if any(isinstance(effect, SensorEffect) for effect in model.effects):
+        # What corrects a reading contradicts both sides: each equation is driven by the other side's reading.
         return None
     fits = fits_of_sides(with_priors(TwoInertiaModel(model.drive), ()), found.stretches)
     good = [

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.estimation.beside_friction import fits_of_starts, held_beside, refitted_beside
+from fitting.estimation.beside_friction import fits_of_starts, refitted_beside
 from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Moved, Stretch
@@ -36,6 +36,7 @@ from fitting.estimation.steady_torque import SteadyLoad
 from fitting.estimation.whiteness import autocorrelation, left_over, ljung_box
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.drive import Prior
+from hdjax.effects.friction import MotorFriction
 
 # Iterations of a trial fit, enough to rank the starts.
 _TRIAL_STEPS = 10
@@ -83,7 +84,8 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Bas
     else:
         alone, beside, start = fits_of_starts(starting_models(model, training), training, halo)
         much = alone.objective - beside.objective > -np.log(MOST_LEFT)
-        best = held_beside(beside, start, training, halo) if much else alone
+        bare = beside.model.without_effect(MotorFriction.name)
+        best = _held_at(beside, bare, training, halo) if much else alone
         source = refitted_beside(best) if much else None
     if is_held(best):
         return BaseFit(eqx.tree_at(lambda f: f.problem.model, best, start), source)
@@ -222,7 +224,7 @@ def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
 
 
 def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:
-    """The base model with its parameters fixed at estimates from one side's equation of motion."""
+    """The base model with its parameters fixed at estimates from one side's equation, or from a fit beside friction."""
     told = model.replace({path: driven.model.get(path) for path in MESH})
     horizon = short_horizon(told, training)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))

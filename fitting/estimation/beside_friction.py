@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from fitting.estimation.driven_load import friction_from_motor
 from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import base_paths, fitted_paths
+from fitting.estimation.free_parameters import fitted_paths
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.scales import largest_torque, scales
 from hdjax import Model, TwoInertiaModel
@@ -58,14 +58,6 @@ def beside_friction(model: Model, training: Sequence[Stretch]) -> Model:
     T_c = max(T_c, _LEAST * largest_torque(training))
     speed = scales(training, model).omega_m
     return model.with_effects(MotorFriction(T_c=T_c, b=max(b, 0.0), transition=_TURN * speed))
-
-
-def held_beside(beside: Fit, start: Model, training: Sequence[Stretch], halo: int) -> Fit:
-    """The base model with its parameters fixed at those of the fit with friction."""
-    told = start.replace({path: beside.model.get(path) for path in base_paths(start)})
-    horizon = short_horizon(told, training)
-    segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
-    return _fitted(told, Strategy(hold_parameters=True), training=training, segmentation=segmentation)
 
 
 def refitted_beside(held: Fit) -> Fit:

@@ -9,7 +9,9 @@ that nothing else shifts their phase alike.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,7 +45,7 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     parts = [_signals(stretch) for stretch in stretches]
 
     def left(row: int, width: int, side: str = "load") -> float:
-        return _unexplained(model, parts, width, step, row, most, side)
+        return _unexplained(model, parts, width, row * step, most * step, side)
 
     coarse = range(-(most // _APART) * _APART, most + 1, _APART)
     near, width = min(itertools.product(coarse, WIDTHS), key=lambda pair: left(*pair))
@@ -61,30 +63,42 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     return row * step if sum(falls) < 2.0 * np.log(MOST_LEFT) else 0.0
 
 
-def _signals(stretch: Stretch) -> tuple[np.ndarray, ...]:
-    """Turn of the motor over N, load angle [rad], logged torques of the motor and on the load [N m], of the first
-    samples."""
+class _Signals(NamedTuple):
+    """The first samples of a stretch.
+
+    Attributes:
+        turn: of the motor over N, from the start [rad].
+        angle: of the load, likewise.
+        T_m: logged torque of the motor [N m].
+        T_l: logged torque on the load [N m].
+        step: sample interval [s].
+    """
+
+    turn: np.ndarray
+    angle: np.ndarray
+    T_m: np.ndarray
+    T_l: np.ndarray
+    step: float
+
+
+def _signals(stretch: Stretch) -> _Signals:
     experiment, part = stretch.experiment, slice(stretch.start, min(stretch.stop, stretch.start + _ENOUGH))
     turn, x = experiment.measured[part, 0], experiment.measured[part, -1]
     load = experiment.load_torque
     T_l = np.zeros(x.size) if load is None else np.asarray(load.coefficients)[part, 0]
-    return turn - turn[0], turn - x - (turn - x)[0], np.asarray(experiment.torque.coefficients)[part, 0], T_l
+    T_m, angle = np.asarray(experiment.torque.coefficients)[part, 0], turn - x
+    return _Signals(turn - turn[0], angle - angle[0], T_m, T_l, experiment.time_step)
 
 
 def _unexplained(
-    model: TwoInertiaModel,
-    parts: Sequence[tuple[np.ndarray, ...]],
-    width: int,
-    step: float,
-    row: int,
-    most: int,
-    side: str,
+    model: TwoInertiaModel, parts: Sequence[_Signals], width: int, late: float, longest: float, side: str
 ) -> float:
     """Unexplained share of the load's mean square acceleration, or of the motor's mean square torque, if the load's
-    readings are `row` rows late."""
-    tests, slopes, curvatures = blind_functions(width, step)
+    readings are late [s]."""
     rows, hop = [], max(1, width // 4)
-    for turn, angle, T_m, T_l in parts:
+    for turn, angle, T_m, T_l, step in parts:
+        tests, slopes, curvatures = blind_functions(width, step)
+        row, most = round(late / step), math.ceil(longest / step - 1e-9)
         inner = slice(most, turn.size - most)
         if turn.size < 2 * most + 3 * width:
             continue

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from fitting.errors import DataError
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.late_readings import aligned, is_aligned
@@ -185,6 +186,9 @@ def fit(
 
     Returns:
         The fit.
+
+    Raises:
+        DataError: an output never changes in the data.
     """
     found = _fit_aligned(*aligned(model, stretches), paths, segmentation, start, strategy, engine)
     for _ in range(_MOST_MOVES):
@@ -215,6 +219,8 @@ def _fit_aligned(
         states=start.states,
         engine=engine,
     )
+    if strategy.reweigh:
+        _refuse_still(problem, stretches)
     moves = float(scales(stretches, model).x) * of_twist(model)[-1]
     shown = Shown.of(problem.model, moves)
     # The scale of a single output affects only the weight of priors: of parameters, and of hidden states.
@@ -251,6 +257,19 @@ def _fit_aligned(
         converged=solution.success,
         steps=steps,
     )
+
+
+def _refuse_still(problem: Problem, stretches: Sequence[Stretch]) -> None:
+    """Refuse data in which an output never changes: its weight would be infinite."""
+    seen = np.asarray(problem.segments.measured)[np.asarray(problem.segments.weight) > 0]
+    for name, swing in zip(problem.model.measured, np.ptp(seen, axis=0), strict=True):
+        if swing == 0.0:
+            ends = [(s.experiment.time[[s.start, s.stop - 1]], s.name) for s in stretches]
+            told = ", ".join(f"{name} from {begin:.4g} s to {end:.4g} s" for (begin, end), name in ends)
+            raise DataError(
+                f"{name.replace('motor_turn', 'motor_angle')} does not change in {told}; cut this part off, or record "
+                "motion in it"
+            )
 
 
 def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution, strategy: Strategy) -> Solution:

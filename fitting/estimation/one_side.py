@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.experiment import Experiment, Moved, Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.projection import FirstStates
@@ -184,7 +184,7 @@ def _driven(
     acceleration = CubicSpline(whole.time[known], (turn if by_motor else load)[known])(whole.time, 2)
     forcing = _through(whole.torque, whole.time, acceleration)
     forces = {"torque": forcing} if by_motor else {"load_torque": forcing}
-    own = {"measured": whole.measured[:, 1:], "outputs": ("dynamic_error",), "motor_angle": None}
+    own = {"measured": whole.measured[:, 1:], "outputs": ("dynamic_error",), "motor_angle": None, "moved": Moved()}
     driven = replace(whole, **forces, **own)
     if strengths is not None:
         shaft = load if by_motor else turn * float(model.drive.N)
@@ -210,7 +210,7 @@ def torque_columns(found: Fit) -> Float[np.ndarray, "segments rows torques"]:
         return np.zeros((*np.asarray(found.error).shape[:1], 0, 0))
     problem = found.at_solution
     linear = linearise(problem, found.unknowns)
-    unit = np.std(np.concatenate([np.asarray(own) for own in torques]), axis=0)
+    unit = np.sqrt(np.mean(np.concatenate([np.asarray(own) for own in torques]) ** 2, axis=0))
     largest = float(found.model.drive.stiffness) * max(float(np.std(s.experiment.measured)) for s in found.stretches)
     sizes = _CHANGE * largest / np.maximum(unit, 1e-300)
     rows, gaps = [], []

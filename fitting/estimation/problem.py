@@ -198,10 +198,10 @@ def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle
 
     Args:
         model: supplies the natural frequency.
-        stretches: supply the sample interval and the largest twist.
+        stretches: supply the longest sample interval and the largest twist.
         step_angle: largest phase advance of the oscillation per step [rad].
     """
-    time_step = stretches[0].experiment.time_step
+    time_step = max(stretch.experiment.time_step for stretch in stretches)
     angle = natural_frequency(model, stretches) * time_step
     return max(int(np.clip(np.ceil(angle / step_angle), 1, 16)), stable_substeps(model, time_step))
 

@@ -31,9 +31,6 @@ from hdjax.effects.learned import LearnedMotorTorque
 from hdjax.engine.pointwise import slopes_at_instants
 from hdjax.parameters import own_value
 
-# Quantity that a sensor effect adds.
-_READING = "reading"
-
 
 class Regressors(eqx.Module):
     """Derivatives by the strengths of an effect, one column for each strength of each proposal.
@@ -69,17 +66,13 @@ def regressors(
         return _with_inertia(seen, stacked, states), memory
     if isinstance(stacked, ActuatorEffect):
         added = {INPUT: _inputs(seen, proposals)}
+    elif isinstance(stacked, SensorEffect):
+        return Regressors(None, _finite(_readings(seen, stacked, states))), memory
     else:
-        motion, own = seen.between, own_between(states)
-        if isinstance(stacked, SensorEffect):
-            motion = jax.tree.map(lambda a: np.asarray(a)[:, :-1], seen.at_knots)
-            own = np.moveaxis(states[:, :-1], 2, 0)
         # An effect's contribution does not depend on other effects.
         bare = replace(seen.model, effects=())
-        added = _by_strength(_added, stacked, bare, motion, own=own)
+        added = _by_strength(_added, stacked, bare, seen.between, own=own_between(states))
     added = {name: _finite(values) for name, values in added.items()}
-    if _READING in added:
-        return Regressors(None, added[_READING]), None
     lands, sizes = [seen.carried[name] for name in added], list(added.values())
     forces = Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))
     # A sensor of the joint torque measures the added torque directly.
@@ -128,11 +121,6 @@ def _with(effect: Effect, strengths: Array) -> Effect:
 def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: Array) -> dict[str, Array]:
     """The quantities that an effect adds at an instant, by name."""
     effect = _with(effect, strengths)
-    if isinstance(effect, SensorEffect):
-        assert motion.theta_m is not None and motion.theta_l is not None
-        assert motion.omega_m is not None and motion.omega_l is not None
-        state = jnp.stack([motion.theta_m, motion.theta_l, motion.omega_m, motion.omega_l])
-        return {_READING: bare.with_effects(effect).outputs(state)}
     if isinstance(effect, MeshGeometryEffect):
         assert motion.theta_m is not None
         return {ERROR: effect.error(motion.theta_m), SLOPE: effect.slope(motion.theta_m)}

@@ -25,7 +25,8 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
         most: largest number of lines.
     """
     # Invalid samples of the longest stretch are zero.
-    series = max(reversed(fit.by_stretch(fit.white_error)), key=len)
+    pairs = zip(fit.stretches, fit.by_stretch(fit.white_error), strict=True)
+    stretch, series = max(reversed([*pairs]), key=lambda pair: len(pair[1]))
     count = series.shape[0]
     if count < 4 * _NEIGHBOURS:
         return ()
@@ -38,7 +39,7 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     ratio[:4] = 0.0
     peaks = _peaks(ratio)
     strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
-    step = float(np.median(np.diff(fit.stretches[0].experiment.time)))
+    step = float(np.median(np.diff(stretch.experiment.time)))
     return tuple((2.0 * np.pi * ((strongest + off_the_grid(power, strongest)) / (2 * count * step))).tolist())
 
 
