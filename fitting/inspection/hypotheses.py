@@ -46,6 +46,7 @@ _RATE_TOLERANCE = 0.03
 _ABOUT_ONE = 0.15  # limits of reduction ratios
 _WHOLE_TOLERANCE = 2e-3
 _COPY = 5.0  # odds of proportionality above which two columns are the same channel
+_MOST_FRAMES = 2000  # assignments of angles for which the other columns are assigned
 _NEARLY = 12.0  # hypotheses less likely than the best by this much are dropped
 
 
@@ -211,7 +212,7 @@ def hypotheses(evidence: Evidence) -> list[Hypothesis]:
     """The likely assignments, the best first."""
     motors, loads, twists = ([None, *evidence.candidates(signal)] for signal in ANGLES)
     frames = [(m, f, x) for m, f, x in product(motors, loads, twists) if _distinct(m, f, x)]
-    weighed = [(evidence.geometry(*frame), frame) for frame in frames]
+    weighed = sorted(((evidence.geometry(*frame), frame) for frame in frames), key=lambda pair: -pair[0])[:_MOST_FRAMES]
     found = []
     for odds, frame in weighed:
         rest, columns = _rest(evidence, *frame)

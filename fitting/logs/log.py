@@ -159,6 +159,9 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     table = read_table(path, wanted) if source is None else _in_memory(path, source, wanted)
     table, drive_file, joined = with_joined_stamps(table, drive_file)
     raw = {s: table.columns[c] for s in SIGNALS if (c := drive_file.column_of(s).column) in table.columns}
+    # A single number under a usual name describes the log.
+    if any(len(column.values) > 1 for column in raw.values()):
+        raw = {s: column for s, column in raw.items() if s in drive_file.columns or len(column.values) > 1}
     refuse_repeated(path, drive_file, table)
     kind = kind_of(path, drive_file, table, raw)
     required = needed_signals(kind, raw, drive_file)

@@ -47,6 +47,7 @@ def with_own_clocks(
         InputError: A clock is missing or invalid, or a name is not unique.
     """
     clocks = _repeated_clocks(table, drive_file.column_of("time").column)
+    in_turn = _come_in_turn(raw)
     found, findings = dict(raw), []
     for signal, column in raw.items():
         place = drive_file.column_of(signal)
@@ -57,6 +58,10 @@ def with_own_clocks(
             stamps, unit = _stamps(path, drive_file, table, signal, name)
         elif column.time is not None:
             stamps, unit = column.time, "s"
+        elif in_turn:
+            stamps, unit = channel(path, drive_file, "time", raw["time"]).values, raw["time"].unit
+            name = drive_file.column_of("time").column
+            column, stamps = _filled(column, stamps)
         else:
             continue
         found[signal], mended = _clocked(path, drive_file, signal, column, stamps, name or place.column, unit)
@@ -65,6 +70,26 @@ def with_own_clocks(
         what = f"{len(clocks)} columns are called '{drive_file.column_of('time').column}'"
         findings.append(Finding("note", what, "time", "each is the clock of the columns that follow it"))
     return found, tuple(findings)
+
+
+def _come_in_turn(raw: Mapping[str, RawColumn]) -> bool:
+    """Whether rows with the same stamp hold different signals, as where logs of several senders are put in one table:
+    they are samples of one instant, and not repeated rows."""
+    if "time" not in raw:
+        return False
+    stamps, known = raw["time"].values, [np.isfinite(c.values) for s, c in raw.items() if s != "time"]
+    if any(len(own) != len(stamps) for own in known):
+        return False
+    same = np.diff(stamps) == 0.0
+    return bool(same.any()) and not any((own[1:] & own[:-1])[same].any() for own in known)
+
+
+def _filled(column: RawColumn, stamps: np.ndarray) -> tuple[RawColumn, np.ndarray]:
+    """A column without its blank rows, and the stamps of the others."""
+    known = np.isfinite(column.values)
+    known[column.text_rows] = True
+    kept = replace(column, values=column.values[known], text_rows=np.cumsum(known)[column.text_rows] - 1)
+    return kept, stamps[known]
 
 
 def _repeated_clocks(table: RawTable, name: str) -> dict[int, str]:

@@ -1,7 +1,7 @@
 """Raw columns of a log file of any format, with the file's names and units."""
 
+import gzip
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
@@ -82,12 +82,13 @@ def _head(path: Path) -> bytes:
 
 
 def _unpacked(path: Path) -> BytesIO:
-    unpacker = zlib.decompressobj(wbits=31)
-    found = unpacker.decompress(path.read_bytes(), _LARGEST)
-    if unpacker.unconsumed_tail:
+    try:
+        with gzip.open(path) as file:
+            found = file.read(_LARGEST + 1)
+    except EOFError as error:
+        raise InputError(f"{path}: the packed file ends too early; copy it again") from error
+    if len(found) > _LARGEST:
         raise InputError(f"{path}: the log is larger than {_LARGEST >> 30} GiB when unpacked; cut it into shorter ones")
-    if not unpacker.eof:
-        raise InputError(f"{path}: the packed file ends too early; copy it again")
     return BytesIO(found)
 
 

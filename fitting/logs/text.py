@@ -76,7 +76,7 @@ class Head:
         """
         columns = {}
         for name, place in self.places(wanted).items():
-            stated = split_unit(self.names[place])[1] if self.names[place] != name else None
+            stated = split_unit(self.names[place])[1]
             below = self.units[place] if place < len(self.units) else None
             columns[name] = replace(found[place], unit=found[place].unit or stated or below or None)
         plain = [split_unit(name)[0] for name in self.names]

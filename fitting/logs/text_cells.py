@@ -13,6 +13,10 @@ _BLANKS = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "?"
 _SECONDS_A_DAY = 86400.0
 _MOST_UNITS = 8
 # With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
+# Groups of three digits; no number begins with a zero before them.
+_THOUSANDS = r"^[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+$"
+# Largest share of stamps that may be incomplete.
+_TORN = 0.05
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
 
 
@@ -94,13 +98,14 @@ def _point(cells: pl.Series, comma_parts_cells: bool) -> pl.Series:
     comma, point = cells.str.contains(",", literal=True), cells.str.contains(".", literal=True)
     if not comma.any():
         several = cells.str.count_matches(r"\.").fill_null(0)
-        return cells.str.replace_all(".", "", literal=True) if (several > 1).any() else cells
+        grouped = cells.filter(several > 0).str.contains(_THOUSANDS.replace(",", r"\."))
+        return cells.str.replace_all(".", "", literal=True) if (several > 1).any() and grouped.all() else cells
     both = comma & point
     if both.any():
         example = str(cells.filter(both.fill_null(value=False))[0])
         grouping = "," if example.rfind(".") > example.rfind(",") else "."
     else:
-        grouped = cells.filter(comma.fill_null(value=False)).str.contains(r"^[-+]?[0-9]{1,3}(,[0-9]{3})+$")
+        grouped = cells.filter(comma.fill_null(value=False)).str.contains(_THOUSANDS)
         several = (cells.str.count_matches(",").fill_null(0) > 1).any()
         # "1,234" has a decimal comma unless the comma is the delimiter.
         grouping = "," if grouped.all() and (several or comma_parts_cells) else "."
@@ -125,24 +130,27 @@ def _quantities(cells: pl.Series, comma_parts_cells: bool) -> tuple[np.ndarray |
 
 
 def _stamps(cells: pl.Series) -> np.ndarray | None:
-    """Seconds of dates (since 1970), times of day or durations; None for others."""
+    """Seconds of dates (since 1970), times of day or durations, NaN for few others; None where many are."""
     # Digits beyond the ninth and time zones are dropped: only differences matter.
     plain = cells.str.replace(",", ".", literal=True).str.replace(r"\s*(Z|UTC|[-+][0-9]{2}:?[0-9]{2})$", "")
     plain = plain.str.replace(r"^([0-9]+):([0-9]{2}\.[0-9]*)$", "0:${1}:${2}")
     parts = plain.str.extract_groups(
         r"^(?:([0-9]+) days?\.?,?\s+)?(?:([0-9./-]+)[T\s_]+)?([0-9]{1,4}):([0-9]{1,2})(?::([0-9]{1,2}(?:\.[0-9]*)?))?$"
     )
-    since, date, hour, minute, second = (parts.struct.field(f) for f in ("1", "2", "3", "4", "5"))
-    if hour.null_count() or len(cells) == 0:
+    known = parts.struct.field("4").is_not_null()
+    if known.sum() < (1.0 - _TORN) * len(cells) or not known.any():
         return None
+    since, date, hour, minute, second = (parts.struct.field(f).filter(known) for f in ("1", "2", "3", "4", "5"))
     clock = [p.cast(pl.Float64, strict=False).fill_null(0.0).to_numpy() for p in (since, hour, minute, second)]
     seconds = clock[0] * _SECONDS_A_DAY + clock[1] * 3600.0 + clock[2] * 60.0 + clock[3]
     if date.null_count() == len(date):
         # The clock restarts at midnight.
-        return seconds + _SECONDS_A_DAY * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY)
-    for form in _DATES:
-        days = date.str.to_date(form, strict=False)
-        if days.null_count() == 0:
-            number = days.cast(pl.Int32).to_numpy()
-            return seconds + _SECONDS_A_DAY * number
-    return None
+        days = np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY)
+    else:
+        read = (date.str.to_date(form, strict=False) for form in _DATES)
+        days = next((found.cast(pl.Int32).to_numpy() for found in read if found.null_count() == 0), None)
+        if days is None:
+            return None
+    stamps = np.full(len(cells), np.nan)
+    stamps[known.to_numpy()] = seconds + _SECONDS_A_DAY * days
+    return stamps

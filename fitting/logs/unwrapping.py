@@ -5,6 +5,8 @@ import numpy as np
 _BITS = (8, 10, 12, 13, 14, 16, 17, 18, 19, 20, 21, 22, 23, 24, 31, 32)
 _OVERFLOWS = (12, 16, 32)
 _FINEST = 1e-9
+# Largest share of samples that may be wrong one by one.
+_RARE = 0.01
 
 
 def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, float, np.ndarray]:
@@ -21,15 +23,17 @@ def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, 
     if _whole(values, 1.0):
         spans += [2.0**bits for bits in _BITS]
     for span in sorted(spans):
-        jumps = _jumps(values, span)
+        counted = values.copy()
+        counted[_lone(values, span)] = np.nan
+        jumps = _jumps(counted, span)
         if jumps is None:
             continue
-        step = _step(values)
+        step = _step(counted)
         folded = step - span * np.rint(step / span)
         change = np.abs(np.diff(folded))
         # A shaft's speed does not jump by an eighth of a revolution from one sample to the next.
         if np.max(np.abs(folded)) < span / 4 and np.quantile(change, 0.999) < span / 8:
-            return _without(values, jumps, span), span, np.flatnonzero(jumps) + 1
+            return values - _turned(counted, jumps, span), span, np.flatnonzero(jumps) + 1
     return values, 0.0, np.zeros(0, dtype=int)
 
 
@@ -46,7 +50,7 @@ def unwrapped_overflow(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarra
         usual = np.quantile(step[~jumps], 0.99)
         # A switched input jumps as far, but does not end at the other limit, and is not smooth elsewhere.
         if usual < span / 20 and folded.max() <= 3 * usual + grid:
-            return _without(values, jumps, span), span, np.flatnonzero(jumps) + 1
+            return values - _turned(values, jumps, span), span, np.flatnonzero(jumps) + 1
     return values, 0.0, np.zeros(0, dtype=int)
 
 
@@ -67,9 +71,28 @@ def _jumps(values: np.ndarray, span: float) -> np.ndarray | None:
     return jumps if jumps.any() else None
 
 
-def _without(values: np.ndarray, jumps: np.ndarray, span: float) -> np.ndarray:
+def _turned(values: np.ndarray, jumps: np.ndarray, span: float) -> np.ndarray:
+    """The part of values that the jumps have added up to each row."""
     turns = np.where(jumps, np.rint(_step(values) / span), 0.0)
-    return values - span * np.concatenate(([0.0], np.cumsum(turns)))
+    return span * np.concatenate(([0.0], np.cumsum(turns)))
+
+
+def _lone(values: np.ndarray, span: float) -> np.ndarray:
+    """Rows of single wrong samples: off from both neighbours, which agree with each other."""
+    rows = np.flatnonzero(np.isfinite(values))
+    known = values[rows]
+    if len(rows) < 3:
+        return rows[:0]
+
+    def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        step = one - other
+        return np.abs(step - span * np.rint(step / span))
+
+    before, own, after = known[:-2], known[1:-1], known[2:]
+    outside = np.abs(known - np.median(known)) > span
+    off = outside[1:-1] | (np.minimum(apart(own, before), apart(after, own)) > span / 8)
+    alone = off & ~outside[:-2] & ~outside[2:] & (apart(after, before) < span / 8)
+    return rows[1:-1][alone] if np.mean(alone) <= _RARE else rows[:0]
 
 
 def _whole(values: np.ndarray, grid: float) -> bool:
