@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from hdjax.dynamics import Inputs, Model, State
+from hdjax.dynamics import BOTH_ANGLES, Inputs, Model, State
 from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.results import Ending, SimulationError
 from hdjax.rubbing import over_step
@@ -32,16 +32,24 @@ class Trajectory(eqx.Module):
         states: states by row; names in `Model.state_names`.
         outputs: of the sensors, see `Model.outputs`.
         ending: an [`Ending`][] as an integer.
+        measured: names of the outputs.
     """
 
     time: Float[Array, " n"]
     states: Float[Array, "n states"]
     outputs: Float[Array, "n outputs"]
     ending: Array
+    measured: tuple[str, ...] = eqx.field(static=True, default=BOTH_ANGLES)
 
     @property
     def dynamic_error(self) -> Float[Array, " n"]:
-        """The measured dynamic error [rad]."""
+        """The measured dynamic error [rad].
+
+        Raises:
+            ValueError: no sensor measures it.
+        """
+        if self.measured[-1] != "dynamic_error":
+            raise ValueError(f"the outputs are {', '.join(self.measured)}; give the model `measured` with both angles")
         return self.outputs[:, -1]
 
 
@@ -197,7 +205,8 @@ def _simulate(
         ending = jnp.where(result == diffrax_result, int(ours), ending)
     failed = (result != dfx.RESULTS.successful) & (ending == int(Ending.successful))
     ending = jnp.where(failed, int(Ending.solver_failed), ending)
-    return Trajectory(times, states, read(model, times, states, torque, load_torque, temperature), ending)
+    outputs = read(model, times, states, torque, load_torque, temperature)
+    return Trajectory(times, states, outputs, ending, model.measured)
 
 
 def read(

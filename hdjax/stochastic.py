@@ -193,4 +193,4 @@ def _simulate_noisy(
     ending = jnp.where(jnp.all(jnp.isfinite(states)), int(Ending.successful), int(Ending.not_finite))
     ending = jnp.where(solution.result == dfx.RESULTS.successful, ending, int(Ending.solver_failed))
     outputs = read(model, times, states[:, : len(model.state_names)], torque, load_torque, None)
-    return Trajectory(times, states, outputs, ending)
+    return Trajectory(times, states, outputs, ending, model.measured)

@@ -1,5 +1,6 @@
 """Implementation of `hdjax simulate`."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from fitting.commands.table import write_table
 from fitting.errors import InputError
 from fitting.stored_model import read_model
 from hdjax import PRESETS, Chirp, Harmonic, TwoInertiaModel, random_phase_multisine, sampled, simulate
+from hdjax.dynamics import BOTH_ANGLES
 
 
 def write_simulation(
@@ -33,6 +35,9 @@ def write_simulation(
     if preset not in PRESETS:
         raise InputError(f"--preset must be one of {', '.join(PRESETS)}, but is {preset}")
     system = TwoInertiaModel(PRESETS[preset]()) if model is None else read_model(model).model
+    if isinstance(system, TwoInertiaModel):
+        # Both angles are written, whatever was measured in the log that the model is from.
+        system = dataclasses.replace(system, measured=BOTH_ANGLES)
     time = np.arange(max(2, round(torque.duration * torque.rate))) / torque.rate
     applied = np.asarray(jax.vmap(_function(torque, seed))(time))
     with spinning("simulating"):

@@ -12,11 +12,13 @@ from hdjax.where import where
 
 @jax.custom_jvp
 def power(base, exponent):
-    """A power; NaN for a negative base."""
-    positive = base > 0.0
+    """A power; NaN for a negative base, unless the exponent is whole."""
     at_zero = where(exponent > 0.0, 0.0, where(exponent == 0.0, 1.0, math.inf))
-    beside = where(base == 0.0, at_zero, math.nan)
-    return where(positive, jnp.exp(exponent * jnp.log(where(positive, base, 1.0))), beside)
+    size = where(base == 0.0, 1.0, jnp.abs(base))
+    value = jnp.exp(exponent * jnp.log(size))
+    odd = exponent - 2.0 * jnp.floor(0.5 * exponent) == 1.0
+    of_negative = where(exponent == jnp.floor(exponent), where(odd, -value, value), math.nan)
+    return where(base > 0.0, value, where(base == 0.0, at_zero, of_negative))
 
 
 @power.defjvp
@@ -25,7 +27,7 @@ def _power_jvp(primals, tangents):
     value = power(base, exponent)
     # The derivative of a zeroth power is zero, and so is that of a zero base.
     by_base = where(exponent == 0.0, 0.0, exponent * power(base, exponent - 1.0))
-    by_exponent = jnp.log(where(base == 0.0, 1.0, base)) * value
+    by_exponent = jnp.log(where(base == 0.0, 1.0, jnp.abs(base))) * value
     return value, by_base * moved + by_exponent * bent
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hdjax.dynamics import Model
 from hdjax.effects import Effect
+from hdjax.effects.learned import Learned
 from hdjax.effects.stiffness import QuadraticStiffness
 from hdjax.sweep.twist_equation import TwistEquation
 from hdjax.sweep.windows import largest_between
@@ -26,7 +27,7 @@ from hdjax.where import where
 
 MOTIONS = 3
 """Largest number of motions, by rising amplitude: low branch, between the folds, high branch."""
-_LOPSIDED: tuple[type[Effect], ...] = (QuadraticStiffness,)
+_LOPSIDED: tuple[type[Effect], ...] = (QuadraticStiffness, Learned)
 _SEARCHES = 60
 _FOUND = 1e-9
 # Newton's error after a step is of the order of its square.

@@ -48,8 +48,8 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
         check = Check(
             other.size,
             unfinished,
-            float(np.max(errors, initial=0.0)),
-            float(np.median(errors)) if errors.size else 0.0,
+            float(np.max(errors)) if errors.size else math.nan,
+            float(np.median(errors)) if errors.size else math.nan,
             reference.description,
         )
         if check.error <= request.tolerance or attempts == 1:
@@ -99,7 +99,7 @@ def _fewest_steps(
         tried = dataclasses.replace(route, substeps=substeps)
         errors, _ = _errors(transients(case, request, tried, values), truth)
         worst = float(np.max(errors, initial=0.0))
-        if worst <= _SAFETY * request.tolerance:
+        if errors.size and worst <= _SAFETY * request.tolerance:
             return tried
         # Rounding errors don't decrease with the step.
         rises = rises + 1 if worst > 0.9 * least and worst < 0.1 else 0

@@ -51,7 +51,7 @@ SRKN14 = Splitting("splitting SRKN14 of order 6", (*_C, 1.0 - 2.0 * sum(_C), *_C
 
 def splits(model: Model, forcing: object) -> bool:
     """Whether a model under a forcing can be split."""
-    return isinstance(forcing, Harmonic) and all(isinstance(e, SPRINGS) for e in model.effects)
+    return isinstance(forcing, Harmonic) and all(type(e) in SPRINGS for e in model.effects)
 
 
 class _Flow(NamedTuple):

@@ -209,7 +209,8 @@ def _roots(case: Case, values: dict[str, Array]) -> tuple[Array, Array]:
     equation, push, _, omega = _posed_lanes(case, values, len(next(iter(values.values()))))
     amplitudes, exists = amplitude_roots(equation, push, omega)
     series = jax.vmap(one_harmonic, in_axes=(None, None, 1), out_axes=1)(equation, omega, amplitudes)
-    return jnp.stack(series, axis=-1), exists
+    # The amplitudes are those of a positive forcing.
+    return jnp.stack(series, axis=-1) * jnp.sign(push)[:, None, None], exists
 
 
 def _padded(series: np.ndarray, width: int) -> np.ndarray:
@@ -252,7 +253,9 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     require_balanced(case.model, case.forcing)
     pilot, other = drawn_points(request)
     values = request.points.values(pilot)
-    offset = np.asarray(request.points.values(pilot).get("forcing.offset", case.forcing.offset))  # pyright: ignore
+    offset = request.points.column("forcing.offset")
+    if offset is None:
+        offset = np.asarray(case.forcing.offset)  # pyright: ignore[reportFunctionMemberAccess]
     odd = symmetric(case.model) and not np.any(offset)
     route = SteadyRoute(_LADDER[-1], odd, _SAFETY * request.tolerance)
     found = steady_states(case, route, values)
@@ -272,6 +275,9 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
 
 def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) -> Check:
     point, motion = np.nonzero(found.exists)
+    reference = f"one period by adaptive Dopri8 of diffrax at rtol {_REFERENCE:g}"
+    if not point.size:
+        return Check(0, 0, math.nan, math.nan, reference)
     # As many orders as there can be: one program for all routes.
     orders = np.arange(1 if route.odd else 0, _LADDER[-1] + 1, 2 if route.odd else 1)
     series = np.stack([found.cosine[point, motion], found.sine[point, motion]], axis=1)
@@ -282,7 +288,6 @@ def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) 
     constants = case, jnp.asarray(orders.astype(float))
     block = {"tile": _CHECKED_BLOCK, "block": _CHECKED_BLOCK}
     errors, reached = in_tiles(_one_period, constants, own, **block, checked=True)
-    reference = f"one period by adaptive Dopri8 of diffrax at rtol {_REFERENCE:g}"
     good = errors[reached]
     error, median = (float(np.max(good)), float(np.median(good))) if good.size else (math.nan, math.nan)
     return Check(int(point.size), int(np.sum(~reached)), error, median, reference)

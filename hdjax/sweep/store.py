@@ -74,7 +74,7 @@ class Store:
         for name, column in self._request.points.values(np.arange(points)).items():
             group.create_array(name, data=column, chunks=(min(points, 1 << 20),), dimension_names=("point",))
         (self.path / _MARKS).mkdir(exist_ok=True)
-        _write(self.path / _PLAN, json.dumps(plan.as_dict() | {"chunk": self.chunk}, allow_nan=False))
+        _write(self.path / _PLAN, json.dumps(plan.as_dict() | {"chunk": self.chunk}))
 
     def finished(self) -> Bool[np.ndarray, " chunks"]:
         """Which chunks are complete."""

@@ -144,4 +144,4 @@ def _size(case: Case, length: Array) -> Array:
     drive = case.model.drive
     gain = drive.k_T / (drive.N * drive.J_m) if hasattr(drive, "J_m") else drive.gain  # pyright: ignore[reportAttributeAccessIssue]
     pushes = jax.vmap(case.forcing)(jnp.linspace(0.0, 1.0, 65) * length)
-    return jnp.maximum(gain * jnp.max(jnp.abs(pushes)) / drive.omega_0**2, 1e-30)
+    return jnp.maximum(jnp.abs(gain) * jnp.max(jnp.abs(pushes)) / drive.omega_0**2, 1e-30)

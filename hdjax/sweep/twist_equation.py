@@ -1,6 +1,7 @@
 """The equation of the dynamic error, for drives without effects on motor or load."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -8,9 +9,12 @@ from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.dynamics import Model
 from hdjax.effects import Effect, MeshTorqueEffect, Motion
 from hdjax.effects.backlash import Backlash
-from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, ThreeSlopeStiffness
+from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
 
-SPRINGS: tuple[type[Effect], ...] = (QuadraticStiffness, QuinticStiffness, ThreeSlopeStiffness, Backlash)
+SPRINGS: tuple[type[Effect], ...] = (
+    *(QuadraticStiffness, QuinticStiffness, ThreeSlopeStiffness, SmoothKneeStiffness),
+    Backlash,
+)
 """Effects whose torque depends on the twist alone."""
 
 
@@ -52,7 +56,19 @@ class TwistEquation(eqx.Module):
 
 def has_twist_equation(model: Model) -> bool:
     """Whether a model moves by [`TwistEquation`][]."""
-    return all(isinstance(e, MeshTorqueEffect) and not e.states for e in model.effects)
+    return all(isinstance(e, MeshTorqueEffect) and _of_twist(e, model.drive) for e in model.effects)
+
+
+def _of_twist(effect: MeshTorqueEffect, drive: Drive | ReducedDrive) -> bool:
+    """Whether an effect depends on the twist and its rate alone."""
+    if effect.states:
+        return False
+    try:
+        jax.eval_shape(lambda x: effect.torque(Motion(x=x, v=x), drive, jnp.zeros(0)), jnp.zeros(()))
+    except (AssertionError, ValueError):
+        # It needs an angle, the time or the temperature.
+        return False
+    return True
 
 
 def twist_equation(model: Model) -> TwistEquation:
