@@ -112,11 +112,13 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
 
 def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[Fit, Fit | None]:
     """The final fit over long horizons; where the model leaves more than noise, with K, alpha and B_sp of the side
-    whose own equation leaves none, and that side's fit."""
+    whose own equation leaves none, and that side's fit. What was fixed, for want of a minimum near the truth, stays."""
     found = eqx.tree_at(lambda f: f.model, found, without_mesh_priors(found.model))
     if max(seen.excess) < RULES.excess:
         return long_fit(found), None
     side = study.side_of(found.model) or better_side(found)
+    if side is None and found.was_held:
+        return found, None
     return long_fit(found if side is None else held_at(side.model, found, side.free.paths)), side
 
 

@@ -248,12 +248,16 @@ def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[flo
     long.
     """
     old = _free_runs(before, study)
-    before_long = rms_error(old)
-    after_long = [rms_error(_free_runs(trial, study)) for trial in trials]
+    before_long, after_long = rms_error(old), long_errors(trials, study)
     moves = float(np.std(np.concatenate([run.measured for run in old])))
-    if not np.isfinite(before_long) or min(before_long, max(after_long)) > 0.5 * moves:
+    if not np.isfinite(before_long) or min(before_long, *after_long) > 0.5 * moves:
         return None
     return [float(np.log(before_long) - np.log(after)) for after in after_long]
+
+
+def long_errors(trials: Sequence[Trial], study: Study) -> list[float]:
+    """Rms errors of free runs along whole held-out stretches; infinite where one diverges."""
+    return [rms_error(_free_runs(trial, study)) for trial in trials]
 
 
 def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
@@ -275,5 +279,5 @@ def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int
         training: training stretches.
         longest_delay: of a delayed or lagging torque [s].
     """
-    step = training[0].experiment.time_step
+    step = min(stretch.experiment.time_step for stretch in training)
     return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))

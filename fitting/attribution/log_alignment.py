@@ -106,7 +106,7 @@ def with_clocks_set(base: Trial, study: Study) -> tuple[Trial, Study]:
     clocked = _set_by(seen, base, study)
     if clocked is None:
         return base, study
-    return attempt(base.model, clocked, base.hold, start=base, hold_parameters=True), clocked
+    return attempt(base.model, clocked, base.hold, start=base, hold_parameters=base.training.was_held), clocked
 
 
 def clock_shifts(before: Sequence[Stretch], after: Sequence[Stretch]) -> tuple[float, ...]:

@@ -13,6 +13,8 @@ from fitting.attribution.candidate_fit import Trial, challenge
 from fitting.attribution.case_evidence import RoundEvidence
 from fitting.attribution.selection_round import Round, Verdict, simplest_first, with_ties
 from fitting.attribution.study import Study
+from fitting.attribution.support import nonzero_effects
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 
 
@@ -69,8 +71,15 @@ def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ..
 
 def _instead_of(winner: Verdict, other: Verdict, effect: Effect, current: Trial, study: Study) -> Verdict:
     """The result of another form in the place of a round's effect in the final model; without a trial where it explains
-    less."""
+    less, or the data do not determine it."""
     model = current.model.without_effect(winner.name).with_effects(effect)
     trial = challenge([model], study, current.hold, champion=current)
+    if trial is not None and not _is_determined(trial, effect.name):
+        trial = None
     lost = 0.0 if trial is None else trial.held_out.objective - current.held_out.objective
     return replace(other, trial=trial, gain=winner.gain - lost)
+
+
+def _is_determined(trial: Trial, name: str) -> bool:
+    """Whether an effect has a significantly nonzero strength and no parameter at a bound."""
+    return not parameters_at_bounds(trial.model, name) and bool(nonzero_effects(trial.training, {name}))

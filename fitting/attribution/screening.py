@@ -5,7 +5,6 @@ its motion. Least squares with these regressors gives each effect's strength and
 also on held-out data. Applied to surrogates of the residual, it gives the null distribution of the best gain.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Generic
@@ -99,7 +98,7 @@ def screen(
     proposals = tuple(effect for effects in found.values() for effect in effects)
     strays = not follows(training, share=_NEAR)
     # Fixed parameters stay fixed: their influence along a motion that deviates is not that along the true one.
-    free_now = () if strays and _was_held(training) else training.free.paths
+    free_now = () if strays and training.was_held else training.free.paths
     skipped = len(training.free.paths) - len(free_now)
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
@@ -158,13 +157,6 @@ def _responses(
             fitted, unseen = (_scores(*pair) for pair in zip(motions, batch.answers, strict=True))
             for effect, columns, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
                 yield effect, columns, states, (fitted, unseen)
-
-
-def _was_held(fit: Fit) -> bool:
-    """Whether a fit's parameters were fixed: unchanged except for rounding."""
-    return all(
-        math.isclose(float(fit.model.get(p)), float(fit.problem.model.get(p)), rel_tol=1e-12) for p in fit.free.paths
-    )
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:

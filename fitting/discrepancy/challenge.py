@@ -6,7 +6,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Trial, long_gains
+from fitting.attribution.candidate_fit import Trial, long_errors
 from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
 from fitting.attribution.decisions import names_stand, next_question
 from fitting.attribution.effect_search import refitted_without
@@ -88,10 +88,10 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         return Challenge(base, beside, left, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
-        gains = long_gains(base, [rival, instead.trial], study)
+        with_names, replaced = long_errors([rival, instead.trial], study)
         # Where both diverge, neither is worse.
-        follow = gains is not None and np.isfinite(gains).any()
-        seen = replace(seen, longer_worse=gains[0] - gains[1] if gains is not None and follow else 0.0)
+        both = np.isinf(with_names) and np.isinf(replaced)
+        seen = replace(seen, longer_worse=0.0 if both else float(np.log(replaced) - np.log(with_names)))
     if instead is not None and beside is not None:
         names = {e.name for e in named.model.effects}
         seen = replace(

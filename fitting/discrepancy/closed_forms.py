@@ -1,6 +1,7 @@
 """Closed forms that resemble a learned function: sign of a rate, dead zone, orders of an angle, powers."""
 
 import itertools
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -104,8 +105,13 @@ def shapes(curve: LearnedCurve) -> Shapes:
 
 def _distinct(ranked: list[_Form]) -> list[_Form]:
     """The best of the forms that differ only in the position of their knee."""
-    heads = {f.labels[0].split("(")[0]: f for f in reversed(ranked)}
-    return [f for f in ranked if heads[f.labels[0].split("(")[0]] is f]
+    heads = {_without_place(f): f for f in reversed(ranked)}
+    return [f for f in ranked if heads[_without_place(f)] is f]
+
+
+def _without_place(form: _Form) -> str:
+    """The label of a form without the position of its knee."""
+    return re.sub(r"[±/][^) ]+", "", form.labels[0])
 
 
 def _forms(curve: LearnedCurve) -> Iterator[_Form]:

@@ -1,5 +1,6 @@
 """Least-squares fit of parameters, initial states and noise covariance to segments of logs."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -150,6 +151,12 @@ class Fit(eqx.Module):
     def with_all_free(self) -> "Fit":
         """The same with fixed parameters counted as free, to compute what the data say about them."""
         return eqx.tree_at(lambda f: f.problem.active, self, jnp.asarray(np.ones(self.problem.active.shape)))
+
+    @property
+    def was_held(self) -> bool:
+        """Whether its parameters were fixed: unchanged except for rounding."""
+        begun, ended = self.problem.model, self.model
+        return all(math.isclose(float(ended.get(p)), float(begun.get(p)), rel_tol=1e-12) for p in self.free.paths)
 
     @property
     def principal_std(self) -> float:

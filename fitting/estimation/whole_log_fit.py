@@ -82,15 +82,13 @@ def refitted_on_all(found: Fit, selection: Fit) -> Fit:
 
 def _on_both(found: Fit, selection: Fit, horizon: int, substeps: int) -> Fit:
     states = np.concatenate([np.asarray(f.unknowns.states)[: f.pieces.sum()] for f in (found, selection)])
-    # Unchanged parameters were fixed.
-    held = all(float(found.model.get(p)) == float(found.problem.model.get(p)) for p in found.free.paths)
     both = fit(
         found.model,
         (*found.stretches, *selection.stretches),
         found.free.paths,
         replace(found.segmentation, horizon=horizon, substeps=substeps, count=len(states)),
         start=Start(found.covariance, jnp.asarray(states)),
-        strategy=replace(_CONTINUED, hold_parameters=held or found.held),
+        strategy=replace(_CONTINUED, hold_parameters=found.was_held or found.held),
     )
     return both.with_all_free()
 

@@ -107,7 +107,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         found: a fit; its parameters are fixed, and its compiled program is used.
     """
     count, length = found.problem.segments.weight.shape
-    half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
+    slowest = max(stretch.experiment.time_step for stretch in found.stretches)
+    half_period = np.pi / natural_frequency(found.model, found.stretches) / slowest
     # In valid samples: a slow channel leaves few rows in which all outputs were measured.
     every = 1.0 / np.mean(np.concatenate([s.weight for s in found.stretches]))
     piece = min(length, int(np.round(np.clip(half_period, 6 * every, 24 * every))))
@@ -124,6 +125,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         weight = np.asarray(segments.weight)
         head = weight * (np.arange(length) < piece)[None]
         head = head * (np.sum(head, axis=1, keepdims=True) >= np.floor(piece / every))
+        if not head.any():
+            continue
         part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         part, unknowns = on_all_devices(part, unknowns)
@@ -140,6 +143,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         seen = linearise(part, unknowns)
         anew = anew.and_more(covariance * head.sum(), float(head.sum()), _states_freedom(part, seen))
         smoothed = smoothed.and_more(*_smoothed(part, seen, piece))
+    if not anew.samples:
+        return found.covariance
     # The residual of logs simulated without noise is the solver's error.
     return jnp.asarray(_of_both(anew, smoothed) + np.diag((_EXACT * swing * of_twist(found.model)) ** 2))
 

@@ -115,9 +115,10 @@ def _judged(steps: Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoi
     """Innovation statistics under noise of given size."""
     innovations, logarithms = filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
     std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
-    each = [_size_and_colour(innovations[0, steps.log == log]) for log in range(shares.size)]
+    counts, logs = steps.counts[steps.lead :], [steps.log == i for i in range(shares.size)]
+    each = [_size_and_colour(innovations[0, own], float(counts[:, own].sum())) for own in logs]
     size, colour = np.max(each, axis=0)
-    samples = int(steps.counts[steps.lead :].sum())
+    samples = int(counts.sum())
     # The innovations are those of the independent combinations.
     units = samples * float(np.linalg.slogdet(sensors.combined)[1])
     likelihood, without = -np.sum(0.5 * innovations**2 + logarithms, axis=(1, 2, 3)) - units
@@ -264,15 +265,16 @@ def _freedom(
     return np.concatenate([angle, angle * omega_0, np.sqrt(np.mean(gaps**2, axis=0))])
 
 
-def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:
-    """Largest rms of an output; and the sum of squared autocorrelations minus its expectation for white noise."""
+def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"], valid: float) -> tuple[float, float]:
+    """Largest rms of an output over the valid samples, where innovations are not zero; and the sum of squared
+    autocorrelations minus its expectation for white noise."""
     square, lags = np.sum(innovations**2, axis=(0, 1)), min(_LAGS, innovations.shape[1] - 1)
     correlation = [
         np.sum(innovations[:, lag:] * innovations[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)
     ]
     count = innovations.shape[0] * innovations.shape[1]
     colour = np.max(np.sum(np.square(correlation), axis=0)) - lags / count
-    return float(np.sqrt(np.max(square) / count)), max(0.0, float(colour))
+    return float(np.sqrt(np.max(square) / max(valid, 1.0))), max(0.0, float(colour))
 
 
 def spread_by_torque(problem: Problem, unknowns: Unknowns, std: float) -> Float[np.ndarray, "segments samples"]:

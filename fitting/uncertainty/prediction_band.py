@@ -63,10 +63,10 @@ class PredictionBand(eqx.Module):
 
 
 def coverage(bands: Sequence[PredictionBand]) -> float:
-    """Share of the measured samples of several runs in their bands; NaN where a band is unknown."""
+    """Share of the valid samples of several runs in their bands; NaN where a band is unknown."""
     if not all(np.isfinite(b.std_predicted).all() for b in bands):
         return np.nan
-    return float(np.mean(np.concatenate([b.inside for b in bands])))
+    return float(np.mean(np.concatenate([b.inside[b.run.counts] for b in bands])))
 
 
 def prediction_bands(

@@ -19,7 +19,7 @@ from fitting.estimation.engines import residual_and_products, residual_with_bloc
 from fitting.estimation.estimate import Fit
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.residual import Problem, Unknowns
-from fitting.uncertainty.standard_errors import Uncertainty
+from fitting.uncertainty.standard_errors import Uncertainty, is_identifiable
 from hdjax.where import where
 
 # Points on each side, in units of the interval of the quadratic approximation; further rounds extend by this factor.
@@ -126,10 +126,8 @@ def with_profiles(fit: Fit, found: Uncertainty) -> Uncertainty:
         old = estimate.ci95
         moved = max(abs(low - old[0]), abs(high - old[1])) if np.isfinite([low, high]).all() else np.inf
         if moved > _ASYMMETRIC * half:
-            known = high / low < np.exp(2.0) if logarithmic and low > 0 else not low <= 0.0 <= high
-            estimates[path] = dataclasses.replace(
-                estimate, ci95=(low, high), identifiable=bool(known), interval="profile"
-            )
+            known = is_identifiable(path, (low, high), logarithmic=bool(logarithmic))
+            estimates[path] = dataclasses.replace(estimate, ci95=(low, high), identifiable=known, interval="profile")
     # `tree_at` would sort the dictionary, and the covariance is in its order.
     return dataclasses.replace(found, estimates=estimates)
 

@@ -170,6 +170,21 @@ def _described(found: Covariance, other: Float[np.ndarray, "parameters parameter
     )
 
 
+def is_identifiable(path: str, interval: tuple[float, float], *, logarithmic: bool) -> bool:
+    """Whether an interval determines a parameter: it excludes zero, or is narrower than a factor of e to either side.
+
+    Args:
+        path: of the parameter.
+        interval: of 95 %.
+        logarithmic: whether its logarithm was fitted.
+    """
+    low, high = interval
+    if logarithmic and low > 0.0:
+        return bool(high / low < np.exp(2.0))
+    # Negative damping is not physical: significantly nonzero does not mean identifiable.
+    return bool(low > 0.0 if path in _DISSIPATIVE else not low <= 0.0 <= high)
+
+
 def _estimate(
     path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
 ) -> Estimate:
@@ -181,11 +196,8 @@ def _estimate(
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)
-        identifiable = reach < 1.0
     else:
         interval = (value - slope * reach, value + slope * reach)
-        # Negative damping is not physical: significantly nonzero does not mean identifiable.
-        identifiable = interval[0] > 0.0 if path in _DISSIPATIVE else not interval[0] <= 0.0 <= interval[1]
     return Estimate(
         path=path,
         value=value,
@@ -193,6 +205,6 @@ def _estimate(
         std_classical=slope * classical,
         ci95=interval,
         unit=info.unit,
-        identifiable=bool(identifiable),
+        identifiable=is_identifiable(path, interval, logarithmic=logarithmic),
         degrees_of_freedom=freedom,
     )
