@@ -9,10 +9,10 @@ from scipy.interpolate import CubicSpline
 
 import joints
 import rig
-from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
-from fitting.estimation.free_parameters import MESH, base_paths
-from fitting.estimation.one_side import held_at
+from fitting.estimation.free_parameters import MESH, base_paths, with_priors
+from fitting.estimation.one_side import fits_of_sides, held_at
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon
 from fitting.estimation.whole_log_fit import long_fit, refitted_on_all
 from fitting.loop import close_loop
@@ -27,6 +27,7 @@ from hdjax.effects.actuation import TorqueGain
 from hdjax.effects.friction import LoadFriction, MotorFriction, StribeckMotorFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.load import ConstantLoad, GravityLoad
+from hdjax.effects.sensing import LoadEncoderDelay, MotorEncoderDelay
 
 SMOOTH = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
 RUBBING = {
@@ -88,6 +89,19 @@ def test_sides_that_contradict_each_other_supply_nothing():
 
 def test_side_whose_inertia_is_unknown_supplies_nothing():
     assert better_side(wrong_law(RUBBING["load equation"], Prior("J_l", SMOOTH.J_l, np.inf))) is None
+
+
+@pytest.mark.parametrize("form", [LoadEncoderDelay, MotorEncoderDelay])
+def test_model_that_corrects_a_reading_by_rows_is_not_checked(form: type[Effect]):
+    """Both equations are driven by a reading; here the readings of the fit are moved."""
+    found = wrong_law(RUBBING["load equation"])
+    late = form(delay=3.0 * joints.STEP)
+    found = fit(
+        found.model.with_effects(late), found.stretches, found.free.paths, found.segmentation, strategy=Strategy(2)
+    )
+    assert any(found.stretches[0].experiment.moved)
+    assert better_side(found) is None
+    assert fits_of_sides(with_priors(TwoInertiaModel(found.model.drive), ()), found.stretches)
 
 
 def test_side_driven_by_late_readings_supplies_nothing():

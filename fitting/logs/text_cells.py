@@ -14,7 +14,7 @@ _SECONDS_A_DAY = 86400.0
 _MOST_UNITS = 8
 # With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
 # Groups of three digits; no number begins with a zero before them.
-_THOUSANDS = r"^[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+$"
+_THOUSANDS = r"^[-+]?[1-9][0-9]{{0,2}}({0}[0-9]{{3}})+$"
 # Largest share of stamps that may be incomplete.
 _TORN = 0.05
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
@@ -98,14 +98,14 @@ def _point(cells: pl.Series, comma_parts_cells: bool) -> pl.Series:
     comma, point = cells.str.contains(",", literal=True), cells.str.contains(".", literal=True)
     if not comma.any():
         several = cells.str.count_matches(r"\.").fill_null(0)
-        grouped = cells.filter(several > 0).str.contains(_THOUSANDS.replace(",", r"\."))
+        grouped = cells.filter(several > 0).str.contains(_THOUSANDS.format(r"\."))
         return cells.str.replace_all(".", "", literal=True) if (several > 1).any() and grouped.all() else cells
     both = comma & point
     if both.any():
         example = str(cells.filter(both.fill_null(value=False))[0])
         grouping = "," if example.rfind(".") > example.rfind(",") else "."
     else:
-        grouped = cells.filter(comma.fill_null(value=False)).str.contains(_THOUSANDS)
+        grouped = cells.filter(comma.fill_null(value=False)).str.contains(_THOUSANDS.format(","))
         several = (cells.str.count_matches(",").fill_null(0) > 1).any()
         # "1,234" has a decimal comma unless the comma is the delimiter.
         grouping = "," if grouped.all() and (several or comma_parts_cells) else "."

@@ -78,7 +78,8 @@ def _turned(values: np.ndarray, jumps: np.ndarray, span: float) -> np.ndarray:
 
 
 def _lone(values: np.ndarray, span: float) -> np.ndarray:
-    """Rows of single wrong samples: off from both neighbours, which agree with each other."""
+    """Rows of single wrong samples: off from both neighbours, or outside the one span that holds nearly all samples,
+    where the neighbours agree."""
     rows = np.flatnonzero(np.isfinite(values))
     known = values[rows]
     if len(rows) < 3:
@@ -89,7 +90,9 @@ def _lone(values: np.ndarray, span: float) -> np.ndarray:
         return np.abs(step - span * np.rint(step / span))
 
     before, own, after = known[:-2], known[1:-1], known[2:]
-    outside = np.abs(known - np.median(known)) > span
+    ordered, width = np.sort(known), span * (1 + _FINEST)
+    low = ordered[np.argmax(np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered)))]
+    outside = (known < low) | (known > low + width)
     off = outside[1:-1] | (np.minimum(apart(own, before), apart(after, own)) > span / 8)
     alone = off & ~outside[:-2] & ~outside[2:] & (apart(after, before) < span / 8)
     return rows[1:-1][alone] if np.mean(alone) <= _RARE else rows[:0]

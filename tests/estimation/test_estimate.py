@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.errors import DataError
 from fitting.estimation.estimate import Fit, Start, Strategy, fit, half_log_determinant, lost
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths
@@ -114,6 +115,15 @@ def test_joint_fit_of_two_logs_reduces_standard_errors(found: Fit):
     gain = uncertainty(alone).estimates["K"].std / uncertainty(joint).estimates["K"].std
     # Twice the data: standard errors shrink by about the square root of two.
     assert 1.1 < gain < 2.2
+
+
+def test_output_that_never_changes_is_refused():
+    """Its weight would be infinite."""
+    experiment = rig.drive_experiment(COUNT)
+    still = experiment.measured.copy()
+    still[:, 0] = still[0, 0]
+    with pytest.raises(DataError, match="motor_angle does not change"):
+        drive_fit(rig.drive_model(), whole(replace(experiment, measured=still)))
 
 
 def test_output_with_large_model_error_is_down_weighted():

@@ -43,6 +43,20 @@ def test_whole_rows_between_the_encoders_are_found_beside_any_effect(beside: str
     assert abs(found - rows) < off + 1e-6
 
 
+@pytest.mark.parametrize("first", ["slow", "quick"])
+def test_delay_is_found_in_logs_of_different_rates(first: str):
+    late, torque = 3 * rig.STEP, np.repeat(rig.drive_torque(COUNT), 4)
+    fine = rig.drive_motion(torque, step=rig.STEP / 4)
+    load = np.concatenate([np.full(12, fine[0, 1]), fine[:-12, 1]])
+    stretches = {}
+    for name, every in (("slow", 4), ("quick", 1)):
+        own = slice(None, None, every)
+        log = rig.log_of_angles(fine[own, 0], load[own], torque[own], ratio=rig.N, step=every * rig.STEP / 4, name=name)
+        stretches[name] = whole([experiment_from_log(log, hold="zero-order", N=rig.N)])
+    both = stretches[first] + stretches["quick" if first == "slow" else "slow"]
+    assert delay_of_load(MODEL, both) == pytest.approx(late)
+
+
 @pytest.mark.parametrize("share", [0.3, 0.8, 1.5])
 def test_friction_of_the_load_with_a_memory_is_no_delay(share: float):
     """It shifts the load's phase, but the motor's equation does not contain it."""

@@ -110,6 +110,11 @@ def test_compressed_and_misnamed_files_are_read(tmp_path: Path, kind: str):
     packed = tmp_path / f"other.{kind}.gz"
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     np.testing.assert_array_equal(values(packed, "a", "b"), [A, B])
+    if kind == "csv":
+        # A logger that opens its file again appends a further part.
+        whole = plain.read_bytes()
+        packed.write_bytes(gzip.compress(whole[:100]) + gzip.compress(whole[100:]))
+        np.testing.assert_array_equal(values(packed, "a", "b"), [A, B])
     if kind != "csv":
         # The format follows from the first bytes.
         odd = Path(shutil.copy(plain, tmp_path / "log.dat"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import joints
-from fitting.drive_data import base_model, ready_log
+from fitting.drive_data import base_model, ready_log, together
 from fitting.errors import InputError
 from fitting.logs.drive_file import read_drive_file
 from fitting.logs.log import Log, read_log
@@ -77,3 +77,31 @@ def test_outputs_after_the_known_samples_are_masked(tmp_path: Path):
 def test_log_with_twist_and_joint_torque_is_quasi_static(tmp_path: Path):
     columns = named("motor_torque", "joint_torque") | {"twist": "load_angle"}
     assert read(tmp_path, columns).kind == "quasi-static"
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_both_angles_replace_a_twist_that_is_not_stated(tmp_path: Path, stated: bool):
+    columns = named("joint_torque", "motor_angle", "load_angle") | {"twist": "load_velocity"}
+    text = DRIVE + ('[columns]\ntwist = "twist"\n' if stated else "")
+    log = read(tmp_path, columns, text)
+    assert log.kind == "quasi-static" and (log.motor_angle is None) == stated
+    twist = ALL.load_velocity if stated else ALL.motor_angle / JOINT.N - ALL.load_angle
+    np.testing.assert_allclose(log.twist, twist, atol=1e-9)
+
+
+def test_single_number_under_a_usual_name_is_no_signal(tmp_path: Path):
+    values = {"time": ALL.time} | {name: getattr(ALL, name) for name in ("motor_angle", "load_angle", "motor_torque")}
+    np.savez(tmp_path / "log.npz", temperature=23.5, **values)
+    (tmp_path / "drive.toml").write_text(DRIVE)
+    log = read_log(tmp_path / "log.npz", read_drive_file(tmp_path / "drive.toml"))
+    assert log.temperature is None and len(log) == 600
+
+
+def test_logs_with_different_outputs_are_not_fitted_together(tmp_path: Path):
+    logs = [
+        read(tmp_path, named("motor_torque", "motor_angle", *more))
+        for more in (("load_angle",), ("load_velocity",), ())
+    ]
+    for other in logs[1:]:
+        with pytest.raises(InputError, match=r"it has motor_angle.* where .* has motor_angle and load_angle"):
+            together([logs[0], other])

@@ -84,6 +84,19 @@ def test_each_signal_is_read_on_its_own_clock(tmp_path: Path):
     np.testing.assert_array_equal(np.asarray(acting.coefficients)[at, 0], TORQUE[5:-5])
 
 
+def test_signals_that_come_in_turn_share_their_stamps(tmp_path: Path):
+    """One row a message: rows of one instant hold different signals."""
+    rows = ["Time,Motor,Load,Torque"]
+    for t, motor, load, torque in np.stack([TIME, MOTOR, FINE[::5, 1], TORQUE], axis=1).tolist():
+        rows += [f"{t!r},{motor!r},,{torque!r}", f"{t!r},,{load!r},"]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    log = read_log(tmp_path / "log.csv", drive(tmp_path))
+    np.testing.assert_array_equal(log.time, TIME)
+    np.testing.assert_array_equal(log.motor_angle, MOTOR)
+    np.testing.assert_array_equal(log.load_angle, FINE[::5, 1])
+    assert log.trusted is None and log.pieces is None
+
+
 def test_only_the_time_common_to_all_signals_is_kept(tmp_path: Path):
     path = save(tmp_path, [(TIME[:1500], MOTOR[:1500]), (TIME[100:], FINE[::5, 1][100:]), (TIME, TORQUE)])
     log = read_log(path, drive(tmp_path))

@@ -111,6 +111,25 @@ def test_angles_sampled_at_different_times_give_the_dynamic_error(tmp_path: Path
     np.testing.assert_allclose(log.dynamic_error[known], x[known], atol=0.01 * np.std(x))
 
 
+def test_pause_of_the_quicker_encoder_is_not_interpolated(tmp_path: Path):
+    torque = rig.drive_torque(COUNT)
+    fine = rig.drive_motion(np.repeat(torque, 4), step=rig.STEP / 4)
+    time = np.arange(4 * COUNT) * rig.STEP / 4
+    motor = np.r_[0 : 2 * COUNT : 2, 2 * COUNT + 400 : 4 * COUNT : 2]
+    path = groups(
+        tmp_path,
+        motor_angle=(time[motor], fine[motor, 0]),
+        load_angle=(time[1::4], fine[1::4, 1]),
+        motor_torque=(time[::4], torque),
+    )
+    log = read_log(path, drive(tmp_path, CLOCKS))
+    assert log.trusted is not None and log.dynamic_error is not None
+    x, known = fine[:, 0] / rig.N - fine[:, 1], np.flatnonzero(log.trusted)
+    places = np.rint(log.time[known] / (rig.STEP / 4)).astype(int)
+    np.testing.assert_allclose(log.dynamic_error[known], x[places], atol=0.01 * np.std(x))
+    assert not np.any((places > 2 * COUNT) & (places < 2 * COUNT + 396))
+
+
 def test_slow_angles_sampled_at_different_times_are_refused(tmp_path: Path):
     time = np.arange(COUNT) * 0.02
     rough = np.random.default_rng(0).normal(size=COUNT)

@@ -101,6 +101,22 @@ def test_quoted_thousands_separators_are_read():
     np.testing.assert_array_equal(found.columns["a"].values, [1234, 12345678])
 
 
+def test_quoted_decimals_of_three_digits_are_no_thousands():
+    found = read('time,a\n"0,001","0,168"\n"0,002","-0,250"\n')
+    np.testing.assert_array_equal(found.columns["a"].values, [0.168, -0.25])
+
+
+def test_torn_cell_keeps_the_decimal_points_of_its_column():
+    column = read("time;a\n0;0.1682942\n1;0.0120.013\n2;0.25\n").columns["a"]
+    np.testing.assert_array_equal(column.values, [0.1682942, np.nan, 0.25])
+    np.testing.assert_array_equal(column.text_rows, [1])
+
+
+def test_column_named_with_its_unit_has_that_unit():
+    found = read("time [ms];a [deg]\n0;1\n1;2\n", wanted=("time [ms]", "a [deg]"))
+    assert [column.unit for column in found.columns.values()] == ["ms", "deg"]
+
+
 @pytest.mark.parametrize(
     ("first", "second"),
     [
@@ -117,6 +133,16 @@ def test_dates_and_times_of_day_become_seconds(first: str, second: str):
     assert column.unit == "s"
     # 2026 is 1.8e9 s from 1970, where doubles lie 0.24 us apart.
     np.testing.assert_allclose(np.diff(column.values), 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("stamp", ["2024-05-01 10:00:{:06.3f}", "10:00:{:06.3f}"])
+def test_torn_stamp_is_one_invalid_cell(stamp: str):
+    stamps = [stamp.format(0.5 * i) for i in range(60)]
+    stamps[30] = stamps[30][:-11]
+    column = read("time;a\n" + "".join(f"{cell};1\n" for cell in stamps)).columns["time"]
+    np.testing.assert_array_equal(column.text_rows, [30])
+    np.testing.assert_allclose(np.diff(column.values)[:29], 0.5, atol=1e-6)
+    assert column.values[31] - column.values[29] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,17 @@ def test_wrapped_angle_with_blank_samples_is_unwrapped():
     np.testing.assert_allclose(np.diff(found[known]), np.diff(ANGLE[known]), atol=1e-12)
 
 
+@pytest.mark.parametrize("wrong", [0.0, 7.0, 100.0, -1.0])
+def test_wrapped_angle_with_lone_wrong_samples_is_unwrapped(wrong: float):
+    wrapped = np.mod(ANGLE, 2 * np.pi)
+    rows = np.array([700, 1500, 2600])
+    wrapped[rows] = wrong
+    found, told, _ = unwrapped_angle(wrapped, 2 * np.pi)
+    assert told == 2 * np.pi
+    right = np.delete(np.arange(COUNT), rows)
+    np.testing.assert_allclose(np.diff(found[right]), np.diff(ANGLE[right]), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     "values",
     [ANGLE, ANGLE / 20, np.random.default_rng(1).uniform(0, 2 * np.pi, COUNT), np.full(COUNT, np.nan), np.zeros(COUNT)],

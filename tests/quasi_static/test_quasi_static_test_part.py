@@ -9,6 +9,7 @@ import pytest
 import slow_joints
 from slow_joints import RATIO, slow_joint
 
+from fitting.errors import DataError
 from fitting.logs.drive_file import DriveFile, read_drive_file
 from fitting.logs.log import Log
 from fitting.quasi_static.results import close_quasi_static_loop
@@ -53,6 +54,20 @@ def test_identified_effect_predicts_test_data_to_the_noise(
     # The rest of the error is the torque's noise.
     assert after < 1.5 * NOISE < 0.3 * before
     assert [log["test"] > 0 for log in found["logs"]] == ([False, True] if named else [True])
+
+
+def test_friction_is_judged_on_a_log_whose_joint_did_not_move(drive_file: DriveFile):
+    moving, _ = slow_joint(moves="both ways", friction=slow_joints.coulomb(4.0), **LONG)
+    held = replace(slow_joint(**LONG, seed=5)[0], name="held")
+    found = report(drive_file, moving, held)
+    assert "motor_friction" in {e["family"] for e in found["after"]["effects"]}
+    assert np.isfinite(found["after"]["rmse"]["test"])
+
+
+def test_test_log_must_have_the_signals_of_the_others(drive_file: DriveFile):
+    log, _ = slow_joint([slow_joints.ripple(3e-5, 2)], moves="both ways", **LONG)
+    with pytest.raises(DataError, match="has no motor_angle"):
+        report(drive_file, log, replace(log, name="other", motor_angle=None))
 
 
 def test_scrambled_test_data_change_only_test_figures(drive_file: DriveFile):

@@ -13,11 +13,12 @@ from hdjax.sweep.cheapest_route import choose
 from hdjax.sweep.points import Points
 from hdjax.sweep.request import Case, Request
 from hdjax.sweep.runge_kutta import march_steps
-from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split
+from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split, splits
 from hdjax.sweep.transients import TransientRoute, transients
 from hdjax.sweep.windows import Windows, largest_between
 
 DURATION, WINDOWS = 40.0, 4
+_SPLIT = {"backlash": True, "undamped_backlash": False, "smooth_knee_stiffness": True, "quadratic_damping": False}
 # mu, omega_0, alpha, amplitude, omega, phase, offset
 CASES = {
     "hardening": (0.05, 1.0, 0.5, 0.3, 0.9, 0.4, 0.0),
@@ -126,6 +127,11 @@ def test_cheapest_route_keeps_the_tolerance(case, tolerance, method):
     assert route.method == method
     assert route.single == (tolerance > 1e-4)
     assert 0.0 < check.error <= tolerance
+
+
+def test_only_what_depends_on_the_twist_alone_is_split():
+    kept = {name: splits(drive_case(BY_NAME[name]()).model, Harmonic(1.0, 1.0)) for name in _SPLIT}
+    assert kept == _SPLIT
 
 
 def test_splitting_of_two_inertias_agrees_with_adaptive_steps():

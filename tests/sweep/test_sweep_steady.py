@@ -84,7 +84,32 @@ def test_harmonic_phases_follow_the_phase_of_the_forcing():
     np.testing.assert_allclose(turned, np.exp(0.7j * orders)[None] * np.ones_like(turned), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["bouc_wen", "input_delay"])
+def test_even_harmonics_are_kept_where_any_point_has_an_offset():
+    """The pilot may hold points without one only."""
+    points = Points({"forcing.omega": np.linspace(0.4, 2.2, 50), "forcing.offset": np.array([0.0, 0.2])})
+    route, _ = choose_steady(case(), Request(points, outputs=("harmonics",)))
+    assert not route.odd
+
+
+def test_motions_of_a_negative_gain_are_in_antiphase():
+    given, request = case(), request_of(9)
+    values = request.points.values(np.arange(request.points.size))
+    turned = eqx.tree_at(lambda c: c.model.drive.gain, given, -given.model.drive.gain)
+    one, other = (steady_states(c, SteadyRoute(9, True, 0.0), values) for c in (given, turned))
+    np.testing.assert_array_equal(one.exists, other.exists)
+    np.testing.assert_allclose(one.cosine[one.exists], -other.cosine[one.exists], atol=1e-9)
+
+
+def test_sweep_without_steady_motions_has_nothing_to_check():
+    """A spring that softens so early that no motion exists at resonance."""
+    points = Points({"alpha": np.full(4, -50.0), "forcing.omega": np.linspace(0.95, 1.0, 16)})
+    _, check = choose_steady(case(), Request(points, outputs=("harmonics",)))
+    assert check.points >= 0 and (check.points or np.isnan(check.error))
+
+
+@pytest.mark.parametrize(
+    "name", ["bouc_wen", "input_delay", "position_dependent_stiffness", "position_dependent_mesh_friction"]
+)
 def test_effects_without_a_harmonic_balance_are_refused(name):
     from hdjax.effects.catalogue import BY_NAME as forms
     from hdjax.effects.effect import Scales

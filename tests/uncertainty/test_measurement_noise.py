@@ -1,5 +1,7 @@
 """Measurement noise of the outputs, estimated with a true model, a wrong one and one that lacks a force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -44,6 +46,16 @@ def test_measurement_noise_is_estimated_despite_a_wrong_frequency():
     # A frequency error of 2 % leaves a far larger residual over many periods than over half of one.
     assert off.principal_std > 1e-2
     assert rms(off) < 0.2 * off.principal_std
+
+
+def test_measurement_noise_of_a_short_log_with_gaps_is_finite():
+    """Two invalid samples in each first part of a segment leave no piece there."""
+    experiment = rig.reduced_experiment(200, noise=NOISE)
+    weight = np.ones(200)
+    weight[10:12] = 0.0
+    model, stretches = rig.reduced_model(), [Stretch(replace(experiment, weight=weight), 0, 200)]
+    held = fit(model, stretches, base_paths(model), Segmentation(256), strategy=Strategy(hold_parameters=True))
+    assert rms(held) == pytest.approx(NOISE, rel=0.3)
 
 
 @pytest.mark.parametrize(("bias", "most"), [(0.0, 1.0), (1.0, _MOTION), (5.0, 1.0)])
