@@ -189,12 +189,14 @@ def respond(
     )
     found = _respond(model, of.free, signals, setup, jnp.asarray(np.concatenate([unknowns, command])))
     outputs, motion, columns, motion_columns = (np.asarray(a) for a in found)
+    with np.errstate(invalid="ignore"):  # a diverging simulation without a limit
+        moved, by_command = motion / units, motion_columns[..., unknowns.size :] / units[:, None]
     return Response(
         outputs.ravel(),
         columns[..., : unknowns.size].reshape(outputs.size, -1),
         columns[..., unknowns.size :].reshape(outputs.size, -1),
-        motion / units,
-        motion_columns[..., unknowns.size :] / units[:, None],
+        moved,
+        by_command,
         motion[:, -1],
     )
 
