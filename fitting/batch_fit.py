@@ -25,7 +25,7 @@ from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from fitting.fit_drive import fit_only
 from fitting.formatting import in_log_words
-from fitting.logs.read_table import LOG_SUFFIXES
+from fitting.logs.read_table import LOG_SUFFIXES, format_suffix
 from fitting.outcome import FitOnly
 from fitting.validation.account import Account
 from hdjax import SimulationError
@@ -54,7 +54,7 @@ def find_logs(folder: Path, *, apart_from: Path) -> tuple[Path, ...]:
         inside = path.relative_to(folder).parts
         if path.resolve().is_relative_to(apart_from.resolve()):
             continue
-        if path.is_file() and path.suffix.lower() in LOG_SUFFIXES and not any(p.startswith(".") for p in inside):
+        if path.is_file() and format_suffix(path) in LOG_SUFFIXES and not any(p.startswith(".") for p in inside):
             found.append(path)
     if not found:
         raise InputError(f"{folder}: no log files in this folder; it should hold {', '.join(LOG_SUFFIXES)} files")

@@ -136,6 +136,7 @@ class _Closed:
             parameters_from=source_of(end.side),
             put_back=late,
             seconds=clock.laps,
+            limited=found.limited,
         )
 
     def _accounts(self, tests: Mapping[Hold, tuple[Stretch, ...]]) -> tuple[Account, Account]:

@@ -134,6 +134,7 @@ class Loop(eqx.Module):
             see [`fitting.one_side_check`][].
         put_back: time offset subtracted from each log's clock [s], so that a line is in phase.
         seconds: time by stage.
+        limited: whether the largest number of effects ended the search.
     """
 
     decision: Outcome = eqx.field(static=True)
@@ -162,6 +163,7 @@ class Loop(eqx.Module):
     parameters_from: str = eqx.field(static=True)
     put_back: tuple[float, ...] = eqx.field(static=True)
     seconds: dict[str, float]
+    limited: bool = eqx.field(static=True)
 
     @property
     def stored(self) -> StoredModel:

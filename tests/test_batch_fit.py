@@ -167,11 +167,11 @@ def test_corrupted_record_is_recomputed(tmp_path: Path, drive: Path, attempted_l
 
 
 def test_log_files_of_a_folder_are_found(tmp_path: Path):
-    for name in ("b.CSV", "a.parquet", "notes.md", ".hidden.csv", ".cache/c.csv", "out/old.csv"):
+    for name in ("b.CSV", "a.parquet", "c.csv.gz", "notes.md", ".hidden.csv", ".cache/c.csv", "out/old.csv"):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.touch()
-    assert [p.name for p in find_logs(tmp_path, apart_from=tmp_path / "out")] == ["a.parquet", "b.CSV"]
+    assert [p.name for p in find_logs(tmp_path, apart_from=tmp_path / "out")] == ["a.parquet", "b.CSV", "c.csv.gz"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no log files"):
         find_logs(tmp_path / "empty", apart_from=tmp_path / "out")

@@ -138,7 +138,9 @@ class Result:
             proposed = experiment_for_ties(outcome, limits, progress=progress)
         else:
             proposed = experiment_for_alpha(outcome, self.rig.experiments[outcome.hold], limits, progress=progress)
-        return replace(self, told=Report.of_rig(outcome, self.rig, next_experiment=proposed))
+        told = Report.of_rig(outcome, self.rig, next_experiment=proposed)
+        told.content["next_experiment_sought"] = True
+        return replace(self, told=told)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `report.json`."""

@@ -35,8 +35,9 @@ class Search(eqx.Module):
         rounds: of the search.
         dropped: names of accepted effects that later ones made superfluous.
         without: the model without each of the kept effects.
-        compared: the rounds of the kept effects, with ties compared in the final model.
         noise: of the measured outputs, where it was estimated.
+        compared: the rounds of the kept effects, with ties compared in the final model.
+        limited: whether the largest number of effects ended it.
     """
 
     named: Trial
@@ -45,6 +46,7 @@ class Search(eqx.Module):
     without: dict[str, Trial]
     noise: MeasurementNoise
     compared: tuple[Round, ...]
+    limited: bool = eqx.field(static=True)
 
 
 def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Study]:
@@ -89,7 +91,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         max_effects: effects to add at most.
         catalogue: candidate forms.
     """
-    current, rounds, noise = base, [], measurement_noise(base.training)
+    current, rounds, noise, limited = base, [], measurement_noise(base.training), False
     while len(rounds) - len(_replaced(rounds)) < max_effects:
         offered, enough = catalogue, False
         if rounds:
@@ -106,6 +108,8 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         # Continue the fit: a remainder that has not converged would be taken for a further effect.
         current = continued(this.winner.trial, study)
         study.progress(f"found {this.winner.name}")
+    else:
+        limited = True
     dropped = [*_holds_given_up(rounds, base.hold, current.hold), *_replaced(rounds)]
     accepted = [this.winner.name for this in rounds if this.accepted and this.winner.name not in dropped]
     current, superfluous, without = _without_superfluous(accepted, current, base, study)
@@ -117,7 +121,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         kept = [instead[name] if (name := this.winner.name) in instead else this for this in kept]
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
-    return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared))
+    return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared), limited)
 
 
 def _without_superfluous(

@@ -11,9 +11,7 @@ from cyclopts import Parameter
 from fitting.errors import InputError
 from fitting.search_options import SearchOptions
 
-Logs = Annotated[
-    list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
-]
+Logs = Annotated[list[Path], Parameter(help="Log files of one drive, of any format.", negative="")]
 AnyLogs = Annotated[list[Path], Parameter(help="Log files of any format, or folders of them.", negative="")]
 TestLogs = Annotated[
     tuple[Path, ...],

@@ -13,8 +13,6 @@ from fitting.commands.spinner import spinning
 from fitting.errors import InputError
 from fitting.search_options import SearchOptions
 
-_NOTHING = "No next experiment: either these logs determine alpha, or no command within the limits was found."
-
 
 def fit_logs(
     logs: list[Path],
@@ -47,7 +45,7 @@ def fit_logs(
         found = fit(data, draws=seed, progress=progress)
         if stated is not None:
             found = found.with_next_experiment(stated, progress=progress)
-    _show(found, out, *([_NOTHING] if stated is not None and found.report["next_experiment"] is None else []))
+    _show(found, out)
 
 
 def close_loop_on_logs(
@@ -104,6 +102,6 @@ def _check_posterior() -> None:
         raise InputError(f"--posterior: {error}") from error
 
 
-def _show(found: Result, out: Path, further: Sequence[str] = ()) -> None:
+def _show(found: Result, out: Path) -> None:
     folder = found.save(out)
-    print("\n".join([found.summary(), *further, f"Report: {folder / 'report.html'}"]))
+    print(f"{found.summary()}\nReport: {folder / 'report.html'}")

@@ -79,11 +79,13 @@ def report_dict(
         "frequency_response": None,
         "posterior": None,
         "meaning": [],
+        "search_limited": False,
         "dropped": list(outcome.dropped),
         "unexplained": unexplained(outcome, noise[output]),
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
         "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
+        "next_experiment_sought": next_experiment is not None,
         "hold": outcome.hold,
         "setting": None,
         **_circumstances(outcome),
@@ -126,6 +128,7 @@ def _of_loop(outcome: Loop, noise: Mapping[str, Any]) -> dict[str, Any]:
         "evidence": dataclasses.asdict(outcome.case),
         "noise": dict(noise) | {"memory": outcome.noise_memory, "torque": outcome.torque_noise},
         "setting": setting,
+        "search_limited": outcome.limited,
     }
 
 

@@ -78,10 +78,14 @@ def next_lines(report: Mapping[str, Any]) -> list[str]:
     proposed = report["next_experiment"]
     if proposed:
         return [*proposed["says"], f"The command is in {proposed['file']}."]
+    if report["next_experiment_sought"]:
+        return ["No next experiment: either none is needed, or no command within the limits was found."]
     if report["decision"] == "fit_only":
         known = report["before"]["parameters"]["alpha"]["identifiable"]
         return [] if known else ["--next-experiment searches for a command that determines alpha."]
-    tie = report["decision"] == "effect_found" and any(not other["separable"] for other in report["alternatives"])
+    # A search tells names from each other, not a learned term.
+    named = report["decision"] == "effect_found" and not report["unknown"]
+    tie = named and any(not other["separable"] for other in report["alternatives"])
     return ["--next-experiment searches for a command that separates the tied explanations."] if tie else []
 
 

@@ -11,6 +11,8 @@ from fitting.report.unknown import place_and_variables
 
 # Smallest relative change of the error that is stated.
 _HARDLY = 0.1
+# Share of the residual below which it does not depend on a quantity.
+_NO_SHARE = 0.01
 
 # A temperature from zero kelvin differs by parts of a kelvin only in its fourth digit.
 _DIGITS_OF_TEMPERATURE = 4
@@ -32,13 +34,14 @@ def _decision(report: Mapping[str, Any]) -> str:
     found = formatting.words([plain_family(f) for f in families]) if families else ""
     decision = report["decision"]
     if decision == "fit_only":
-        return f"The base model was fitted. On {on} data it errs by {_against_noise(before, noise, unit)}."
+        return f"The base model was fitted. On {on} data {_errs(before, noise, unit)}."
     if decision == "model_sufficient":
-        errs = f"on {on} data it errs by {_against_noise(before, noise, unit)}"
+        errs = f"on {on} data {_errs(before, noise, unit)}"
         drifts = before is None or before >= RULES.excess * noise
+        gains = f"none of the {report['forms_tried']} tried forms of missing physics has a significant gain"
         return (
-            f"The model suffices: {'over short segments it leaves only noise' if drifts else errs}, and none of the "
-            f"{report['forms_tried']} tried forms of missing physics has a significant gain."
+            f"The model suffices: {'over short segments it leaves only noise' if drifts else errs}, and "
+            f"{gains if report['forms_tried'] else 'no form of missing physics was tried'}."
             + (f" Free runs drift: {errs}." if drifts else "")
             + _remembering(report)
             + _noisy_torque(report)
@@ -62,21 +65,30 @@ def _decision(report: Mapping[str, Any]) -> str:
         change = _change(subject, report, several=several)
         return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
     left = report["unexplained"]
-    missing = f"missing{_WHERE_MISSING.get(report['parameters_from'], '')} that the catalogue does not explain."
+    missing = f"missing{_WHERE_MISSING.get(report['parameters_from'], '')}"
+    missing += (
+        ": --max-effects ended the search." if report["search_limited"] else " that the catalogue does not explain."
+    )
     opening = f"A part was found ({found}), but something else is {missing}" if families else f"Something is {missing}"
     if report["unknown"]:
-        return f"{opening} {_change(f'A learned {_learned(report)},', report)}"
+        learned = f"learned {_learned(report)},"
+        return f"{opening} {_change(f'Together with a {learned} it' if families else f'A {learned}', report)}"
+    if report["evidence"]["final"]["at_bounds"]:
+        return f"{opening} A parameter of what was found has ended at a bound: its law does not fit."
     beyond = left["free_runs_times_expected"]
-    if beyond is not None:
-        return (
-            f"{opening} Short segments hardly show it: free runs of whole stretches err by "
-            f"{_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and "
-            "uncertainty allow."
+    if beyond is not None and beyond > RULES.surprise:
+        told = (
+            f"{_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and uncertainty allow"
         )
-    return (
-        f"{opening} The residual is {formatting.number(left['times_noise'])} times the measurement noise, and depends "
-        f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)."
-    )
+        return (
+            f"{opening} Short segments hardly show it: free runs of whole stretches "
+            f"{'diverge' if after is None else f'err by {told}'}."
+        )
+    depends = f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)"
+    if left["explained_share"] < _NO_SHARE:
+        depends = "on none of the quantities that were examined"
+    size = max(left["times_noise"], report["times_noise"])
+    return f"{opening} The residual is {formatting.number(size)} times the measurement noise, and depends {depends}."
 
 
 def summary_of_extrapolation(told: Sequence[Mapping[str, Any]]) -> str:
@@ -152,6 +164,10 @@ def _against_noise(value: float | None, noise: float, unit: str, like: float | N
     if value is None:
         return _rmse(value, unit)
     return f"{_rmse(value, unit, like)} rms ({formatting.number(value / noise)} times the measurement noise)"
+
+
+def _errs(value: float | None, noise: float, unit: str) -> str:
+    return "its free run diverges" if value is None else f"it errs by {_against_noise(value, noise, unit)}"
 
 
 def _falls(before: float | None, after: float | None) -> bool:
