@@ -74,7 +74,7 @@ def feedforward(
         ValueError: an effect has memory or depends on the output angle.
     """
     for effect in model.effects:
-        if effect.states or isinstance(effect, LoadSideEffect):
+        if effect.states or isinstance(effect, LoadSideEffect) or "theta_l" in effect.angles:
             raise ValueError(
                 f"`{effect.name}` has memory or depends on the output angle: no period of a motor revolution"
             )
@@ -105,9 +105,15 @@ def feedforward(
             ],
             axis=1,
         )
-        no_torque = jnp.zeros_like(t)
-        free = jax.vmap(model.rates)(states, no_torque, jnp.full(samples, 1.0) * load_torque)
-        return jnp.stack([drive.J_l * (y_2 - free[:, 3]), drive.J_m * (drive.N * (x_2 + y_2) - free[:, 2])])
+
+        def rates_under(torque: float) -> Array:
+            loads = jnp.full(samples, 1.0) * load_torque
+            return jax.vmap(model.rates)(states, jnp.full(samples, torque), loads)
+
+        # The motor's acceleration is linear in the torque.
+        free, pushed = rates_under(0.0), rates_under(1.0)
+        lacking = (drive.N * (x_2 + y_2) - free[:, 2]) / (pushed - free)[:, 2]
+        return jnp.stack([drive.J_l * (y_2 - free[:, 3]), lacking])
 
     length = jnp.maximum(jnp.max(jnp.abs(_geometry(model))), jnp.abs(load_torque) / drive.K)
     length = jnp.where(length > 0.0, length, 1.0)
@@ -165,12 +171,14 @@ class ServoTorque(eqx.Module):
 
     Attributes:
         servo: its gains.
+        k_T: ratio of the acting to the commanded torque.
         speed: commanded mean motor rate [rad/s].
         correction: of the commanded motor angle, around `speed * t` [rad].
         feedforward: torque added to the servo's [N m].
     """
 
     servo: MotorServo
+    k_T: Array
     speed: Array = eqx.field(converter=as_scalar)
     correction: FourierSeries
     feedforward: FourierSeries
@@ -178,7 +186,8 @@ class ServoTorque(eqx.Module):
     def __call__(self, t: Array) -> Array:
         angle = self.speed * t + self.correction(t)
         rate = self.speed + self.correction.derivative()(t)
-        return self.servo.stiffness * angle + self.servo.damping * rate + self.feedforward(t)
+        # The servo's reaction acts as it is.
+        return (self.servo.stiffness * angle + self.servo.damping * rate) / self.k_T + self.feedforward(t)
 
 
 def run_at_speed(
@@ -211,11 +220,12 @@ def run_at_speed(
     if correction is not None:
         angle = correction.correction if "motor_angle" in use else nothing
         torque = correction.torque if "torque" in use else nothing
+    driven = plant.with_effects(servo)
     return simulate(
-        plant.with_effects(servo),
-        ServoTorque(servo, speed, angle, torque),
+        driven,
+        ServoTorque(servo, plant.drive.k_T, speed, angle, torque),
         times,
-        jnp.stack([jnp.zeros(()), jnp.zeros(()), speed, speed / plant.drive.N]),
+        driven.settled(jnp.stack([jnp.zeros(()), jnp.zeros(()), speed, speed / plant.drive.N])),
         load_torque=harmonic_series(speed, 0.0, mean=load_torque),
         rtol=1e-9,
         atol=1e-12,

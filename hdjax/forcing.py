@@ -74,7 +74,8 @@ def random_phase_multisine(
         ValueError: no line is between the two frequencies.
     """
     line = 2 * jnp.pi / period
-    first, last = int(jnp.ceil(omega_min / line)), int(jnp.floor(omega_max / line))
+    # The edges are lines of the band, to rounding.
+    first, last = int(jnp.ceil(omega_min / line - 1e-9)), int(jnp.floor(omega_max / line + 1e-9))
     if last < max(first, 1):
         raise ValueError(
             f"`period` must be long enough for a line between {omega_min} and {omega_max} rad/s, but is {period} s"

@@ -72,6 +72,10 @@ def read_design_file(path: Path) -> DesignFile:
             file.number("robust", "share", robust.get("share", 0.05)),
             CatalogueGear() if SIZE in {v.path for v in variables} else Replaced(),
         )
+        if isinstance(study.maker, CatalogueGear) and study.draws and {"K", "alpha"} & {*study.draws.paths}:
+            raise file.refuse(
+                f"[robust] K and alpha follow from `{SIZE}`: leave them out of spread, or name them in hold"
+            )
         study.refuse()
         return DesignFile(study, _search(file))
     except (TypeError, ValueError) as error:
@@ -152,10 +156,6 @@ def _argument(file: Sections, where: str, key: str, value: object, default: obje
             raise file.refuse(f"[{where}] {key} must be true or false, but is {value!r}")
         return value
     return file.count(where, key, value) if isinstance(default, int) else file.number(where, key, value)
-
-
-def _weight(file: Sections, label: str, table: dict[str, Any]) -> float:
-    return file.number(f"objective.{label}", "weight", table.get("weight", 1.0))
 
 
 def _limit(file: Sections, label: str, table: dict[str, Any]) -> Limit:

@@ -38,6 +38,9 @@ def write_simulation(
     if isinstance(system, TwoInertiaModel):
         # Both angles are written, whatever was measured in the log that the model is from.
         system = dataclasses.replace(system, measured=BOTH_ANGLES)
+    warm = [e.name for e in system.effects if e.needs_temperature]
+    if warm:
+        raise InputError(f"{model}: {warm[0]} needs a temperature, which a simulation of a torque lacks")
     time = np.arange(max(2, round(torque.duration * torque.rate))) / torque.rate
     applied = np.asarray(jax.vmap(_function(torque, seed))(time))
     with spinning("simulating"):

@@ -1,5 +1,6 @@
 """Implementation of `hdjax speeds`."""
 
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -15,8 +16,10 @@ from fitting.commands.spinner import spinning
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from hdjax import Drive, TwoInertiaModel
-from hdjax.effects.kinematic import KinematicError
+from hdjax.effects import MeshGeometryEffect
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic
 from hdjax.response.coexisting import from_both_ends
+from hdjax.response.continuation import Branch
 from hdjax.response.critical_speeds import SpeedBand, can_persist, critical_speeds, speeds_to_avoid
 from hdjax.response.plots import speed_plot
 
@@ -56,24 +59,29 @@ def show_speeds(
             f"--fastest must be below {_BEYOND * float(made.omega_0) * _RPM:.0f} rpm, where all resonances lie, "
             f"but is {fastest:g}"
         )
-    own = [e for e in effects if isinstance(e, KinematicError)]
-    error = own[0] if own else KinematicError(cos_2=kinematic_error)
-    size = float(jnp.max(jnp.abs(error.error(jnp.linspace(0.0, 2 * jnp.pi, 256)))))
+    own = tuple(e for e in effects if isinstance(e, MeshGeometryEffect)) or (KinematicError(cos_2=kinematic_error),)
+    over = [e.name for e in own if "theta_l" in e.angles]
+    if over:
+        raise InputError(
+            f"{drive.model}: {over[0]} does not repeat with the motor's revolution; give a model without it"
+        )
+    around = jnp.linspace(0.0, 2 * jnp.pi, 256)
+    size = float(jnp.max(jnp.abs(sum(error.error(around) for error in own))))
     limit = 3.0 * size if limit is None else limit
     if not limit > 0.0:
         raise InputError(f"{drive.model}: its kinematic error is zero; give a model with one, or none and a preset")
-    orders = [n for n in KinematicError.orders if jnp.hypot(getattr(error, f"cos_{n}"), getattr(error, f"sin_{n}"))]
-
-    model = TwoInertiaModel(made, (error,))
+    orders = sorted({n for error in own for n in _orders(error)})
+    model = TwoInertiaModel(made, own)
     with spinning("following the response over the speed"):
-        branches = from_both_ends(model, None, slowest / _RPM, fastest / _RPM, rotating=True, harmonics=12)
+        branches = from_both_ends(
+            model, None, slowest / _RPM, fastest / _RPM, rotating=True, harmonics=max(12, *(2 * n for n in orders))
+        )
     if not any(bool(b.complete) for b in branches):
         raise DataError(
             "the response could not be followed from --slowest to --fastest; narrow the range, or give more --B_sp"
         )
     bands = speeds_to_avoid(*branches, limit=limit)
-    ranges = [np.asarray(b.omega)[np.asarray(can_persist(b))] * _RPM for b in branches]
-    both = None if len(branches) == 1 else (float(ranges[1].min()), float(ranges[0].max()))
+    both = _coexisting(branches)
     files: dict[Path, str | bytes] = {}
     if out is not None:
         document = {"schema": "hdjax-speeds/1", "limit": limit, "avoid": _rows(bands), "two_motions_rpm": both}
@@ -98,6 +106,26 @@ def show_speeds(
             f"From {both[0]:.1f} to {both[1]:.1f} rpm two motions exist; which one occurs depends on the initial state."
         )
     show_files(files)
+
+
+def _orders(error: MeshGeometryEffect) -> list[int]:
+    """Cycles of a kinematic error in a revolution of the motor."""
+    if isinstance(error, KinematicHarmonic):
+        return [round(float(error.n))]
+    return [n for n in KinematicError.orders if jnp.hypot(getattr(error, f"cos_{n}"), getattr(error, f"sin_{n}"))]
+
+
+def _coexisting(branches: Sequence[Branch]) -> tuple[float, float] | None:
+    """The widest range of motor speeds [rpm] with two motions that can persist; None without any."""
+    ranges = []
+    for branch in branches:
+        rows = np.flatnonzero(can_persist(branch))
+        for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+            if run.size:
+                speeds = np.asarray(branch.omega)[run] * _RPM
+                ranges.append((float(speeds.min()), float(speeds.max())))
+    both = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in itertools.combinations(ranges, 2)]
+    return max((pair for pair in both if pair[0] < pair[1]), key=lambda pair: pair[1] - pair[0], default=None)
 
 
 def _rows(bands: Sequence[SpeedBand]) -> list[dict[str, float]]:

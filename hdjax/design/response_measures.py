@@ -1,6 +1,7 @@
 """Measures of the steady response, by harmonic balance."""
 
 import abc
+import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -11,14 +12,29 @@ from jaxtyping import Array
 
 from hdjax.design.case import Case
 from hdjax.design.measure import SpeedRange, number
-from hdjax.design.steady import Range, balanced, followed, largest_swing, motions_at, with_system
+from hdjax.design.steady import (
+    HARMONICS,
+    Range,
+    balanced,
+    error_swing,
+    followed,
+    largest_swing,
+    motions_at,
+    with_system,
+)
 from hdjax.drive import restoring
-from hdjax.effects import ActuatorEffect, LoadSideEffect
+from hdjax.dynamics import TwoInertiaModel
+from hdjax.effects import ActuatorEffect, LoadSideEffect, MeshGeometryEffect
+from hdjax.effects.kinematic import KinematicHarmonic
+from hdjax.fourier import FourierSeries
 from hdjax.parameters import Scalar
 from hdjax.response.continuation import Branch
 from hdjax.response.fold import folds
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState
 from hdjax.where import where
+
+# Of a revolution, for the largest twist of the mesh.
+_SAMPLES = 64
 
 
 class ResponseMeasure(SpeedRange):
@@ -48,8 +64,16 @@ class ResponseMeasure(SpeedRange):
                 raise ValueError(f"`{self.name}` rests on harmonic balance, which can't carry the effect {effect.name}")
         if not rotating and not (case.excitation.amplitude != 0.0 or case.excitation.load_amplitude != 0.0):
             raise ValueError(f"`{self.name}` needs a torque: forcing.amplitude and forcing.load_amplitude are zero")
-        if rotating and not any(e.family == "kinematic_error" for e in case.model.effects):
+        errors = [e for e in case.model.effects if isinstance(e, MeshGeometryEffect)]
+        if rotating and not errors:
             raise ValueError(f"`{self.name}` needs a kinematic error where the motor rotates, but there is none")
+        for effect in errors if rotating else ():
+            if "theta_l" in effect.angles:
+                raise ValueError(f"`{self.name}` rests on harmonic balance, but {effect.name} has a longer period")
+            if isinstance(effect, KinematicHarmonic) and float(effect.n) > HARMONICS:
+                raise ValueError(
+                    f"`{self.name}` balances orders up to {HARMONICS}, but {effect.name} has order {float(effect.n):g}"
+                )
 
 
 def responses(case: Case, measures: Sequence[ResponseMeasure]) -> list[Array]:
@@ -84,17 +108,29 @@ class PeakError(ResponseMeasure):
 
 
 class MeshTorque(ResponseMeasure):
-    """Elastic torque in the mesh at that largest swing, `K f(x)` [N m], to be held below the gear's rating."""
+    """Largest elastic torque in the mesh, `K f(x)` [N m], to be held below the gear's rating: at the largest swing of the
+    dynamic error, or of the twist behind the kinematic error where the motor rotates."""
 
     name: ClassVar[str] = "mesh_torque"
     unit: ClassVar[str] = "N m"
-    says: ClassVar[str] = "elastic mesh torque at the largest swing between slow and fast"
+    says: ClassVar[str] = "largest elastic mesh torque between slow and fast"
     slow: Scalar = number()
     fast: Scalar = number()
     rotating: bool = False
 
     def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
-        return case.drive.K * restoring(largest_swing(system, self.looked_at, branches)[0], case.drive.alpha)
+        size = functools.partial(mesh_twist, case.model) if self.rotating else error_swing
+        return case.drive.K * restoring(largest_swing(system, self.looked_at, branches, size)[0], case.drive.alpha)
+
+
+def mesh_twist(model: TwoInertiaModel, motion: SteadyState) -> Array:
+    """Largest twist of the mesh over a revolution of the motor, kinematic error included [rad]."""
+    angles = jnp.arange(float(_SAMPLES)) * (2 * jnp.pi / _SAMPLES)
+    series = motion.motion
+    x, theta_l = FourierSeries(1.0, series.mean, series.cosine, series.sine)(angles).T
+    theta_m = angles + model.drive.N * (x + theta_l)
+    states = jnp.stack([theta_m, theta_m / model.drive.N - x, jnp.zeros_like(x), jnp.zeros_like(x)], axis=1)
+    return jnp.max(jnp.abs(jax.vmap(lambda state: model.motion(state).x)(states)))
 
 
 class Loss(ResponseMeasure):
@@ -126,13 +162,14 @@ def power_in(case: Case, motion: SteadyState, *, rotating: bool) -> Array:
     """Mean power of the torques on a steady motion [W]."""
     series, torques = motion.motion, case.excitation
     if rotating:
-        return motion.mean_torque * series.omega
+        return case.drive.k_T * motion.mean_torque * series.omega
     x = series.sine[0, 0]
     if not case.model.effects:
         push = case.drive.error_forcing(torques.amplitude, torques.load_amplitude)
         return 0.5 * series.omega * x * push / case.drive.c
     load = series.sine[1, 0]
-    return 0.5 * series.omega * (torques.amplitude * case.drive.N * (x + load) + torques.load_amplitude * load)
+    motor = case.drive.k_T * torques.amplitude * case.drive.N * (x + load)
+    return 0.5 * series.omega * (motor + torques.load_amplitude * load)
 
 
 class FoldDistance(ResponseMeasure):

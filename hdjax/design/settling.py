@@ -75,17 +75,17 @@ class SettlingTime(Measure):
 
 
 def _released(case: Case, twist: Array, time: Array) -> tuple[Array, Array]:
-    """Twist and its rate from rest at a twist, with no torque."""
+    """Twist of the mesh and its rate from rest at a twist, with no torque."""
     nothing = PiecewisePolynomial(time, jnp.zeros((time.size - 1, 1)))
     zero = jnp.zeros_like(twist)
     model: Model
     if case.model.effects:
-        model, motion = case.model, jnp.stack([case.drive.N * twist, zero, zero, zero])
+        # The twist of the mesh, from which the dynamic error differs by the kinematic error.
+        error = case.model.motion(jnp.zeros(4)).x
+        model, motion = case.model, jnp.stack([zero, error - twist, zero, zero])
     else:
         model, motion = ReducedModel(case.drive.reduced()), jnp.stack([twist, zero])
     states, end = march(model, nothing, None, model.settled(motion), solver=dfx.Tsit5(), substeps=1)
     states = jnp.concatenate([states, end[None]])
-    if isinstance(model, ReducedModel):
-        return states[:, 0], states[:, 1]
-    N = case.drive.N
-    return states[:, 0] / N - states[:, 1], states[:, 2] / N - states[:, 3]
+    moving = jax.vmap(model.motion)(states)
+    return moving.x, moving.v

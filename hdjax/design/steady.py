@@ -7,7 +7,7 @@ or at an end. A smooth maximum would exceed the largest value by an amount that 
 would miss a peak between two of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -97,6 +97,11 @@ def swing(x: FourierSeries) -> Float[Array, ""]:
     return FourierSeries(x.omega, jnp.zeros_like(x.mean), x.cosine, x.sine).largest()
 
 
+def error_swing(motion: SteadyState) -> Float[Array, ""]:
+    """[`swing`][] of a motion."""
+    return swing(motion.x)
+
+
 def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> SteadyState:
     """The motion near a solution, with gradients by all parts of the system."""
     u = jax.lax.stop_gradient(unknowns)
@@ -106,8 +111,13 @@ def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> S
     return system.steady_state(found, omega, jnp.max(jnp.abs(left)) < _SOLVED)
 
 
-def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) -> tuple[Float[Array, ""], SteadyState]:
-    """The largest swing of all steady motions found in a range, stable or not, and the motion.
+def largest_swing(
+    system: BalancedMotion,
+    looked_at: Range,
+    branches: Branch,
+    size_of: Callable[[SteadyState], Float[Array, ""]] = error_swing,
+) -> tuple[Float[Array, ""], SteadyState]:
+    """The largest swing, or another size, of all steady motions found in a range, stable or not, and the motion.
 
     NaN where neither branch could be followed to the other end, so that the peak may have been missed.
 
@@ -116,7 +126,7 @@ def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) ->
 
     def of_one(branch: Branch) -> tuple[Array, SteadyState]:
         live = with_system(branch, system)
-        rows = jax.vmap(lambda u, w: swing(system.steady_state(u, w, w > 0.0).x))(branch.unknowns, branch.omega)
+        rows = jax.vmap(lambda u, w: size_of(system.steady_state(u, w, w > 0.0)))(branch.unknowns, branch.omega)
         rows = where(branch.valid, jax.lax.stop_gradient(rows), -1.0)
         top = peak(live)
         within = top.converged & (top.value >= looked_at.slow) & (top.value <= looked_at.fast)
@@ -124,7 +134,7 @@ def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) ->
         picked = jnp.stack([jnp.argmax(rows), jnp.zeros_like(last), last])
         at_rows = jax.vmap(lambda i: solved_once_more(system, branch.unknowns[i], branch.omega[i]))(picked)
         motions = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), top.steady_state, at_rows)
-        sizes = jax.vmap(lambda m: swing(m.x))(motions)
+        sizes = jax.vmap(size_of)(motions)
         # The largest row is used where the peak was not located, or is another one: the peak is that of the mean
         # square. Near the same peak it is slightly smaller, and jumps from row to row.
         same = within & (picked[0] > 0) & (picked[0] < last) & (sizes[1] < (1.0 + _ANOTHER) * sizes[0])

@@ -213,7 +213,7 @@ def balance(
             raise ValueError(
                 f"`{effect.name}` has memory or acts on a logged torque: use the time domain (`shoot`, `swept_sine`)"
             )
-        if rotating and isinstance(effect, LoadSideEffect):
+        if rotating and (isinstance(effect, LoadSideEffect) or "theta_l" in effect.angles):
             raise ValueError(f"`{effect.name}` turns with the output: its period is not the motor's revolution")
     if rotating and not isinstance(model, TwoInertiaModel):
         raise ValueError("`rotating` needs a TwoInertiaModel: a reduced drive has no motor angle")
