@@ -108,8 +108,10 @@ class PeakError(ResponseMeasure):
 
 
 class MeshTorque(ResponseMeasure):
-    """Largest elastic torque in the mesh, `K f(x)` [N m], to be held below the gear's rating: at the largest swing of the
-    dynamic error, or of the twist behind the kinematic error where the motor rotates."""
+    """Largest elastic torque in the mesh, `K f(x)` [N m], to be held below the gear's rating.
+
+    It is that at the largest swing of the dynamic error; where the motor rotates, at the largest twist of the mesh.
+    """
 
     name: ClassVar[str] = "mesh_torque"
     unit: ClassVar[str] = "N m"

@@ -18,6 +18,7 @@ from hdjax.design.measure import Measure
 from hdjax.design.measures import MEASURES
 from hdjax.design.settling import SettlingTime
 from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.kinematic import KinematicError
 
 DRIVE = dataclasses.replace(hdc_40_050(), B_sp=1.0)
 
@@ -129,6 +130,13 @@ def test_settling_time_of_a_linear_drive_follows_its_damping():
 def test_settling_time_beyond_the_simulation_is_extrapolated():
     soon, late = (eqx.filter_jit(SettlingTime(5.0, 1e-5, turns=turns)) for turns in (60, 12))
     assert float(late(case())) == pytest.approx(float(soon(case())), rel=0.01)
+
+
+def test_settling_time_is_that_of_the_mesh_beside_a_kinematic_error():
+    """The drive comes to rest at an angle at which the encoders show the error."""
+    found = SettlingTime(5.0, 5e-5)
+    wavy = dataclasses.replace(case(), model=case().model.with_effects(KinematicError(cos_2=1.5e-4)))
+    assert float(found(wavy)) == pytest.approx(float(found(case())), rel=0.02)
 
 
 def test_settling_time_with_friction_agrees_with_scipy_and_is_shorter():

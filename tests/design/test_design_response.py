@@ -9,7 +9,8 @@ import pytest
 from hdjax import Drive, TwoInertiaModel
 from hdjax.design import Case, Excitation
 from hdjax.design.response_measures import FoldDistance, Loss, MeshTorque, PeakError, outside, responses
-from hdjax.effects.kinematic import KinematicError
+from hdjax.effects import MeshGeometryEffect
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
 
 # In units in which omega_0 = 1 and c = 1: J_m = J_l = 2, N = 1.
 MU, TORQUE = 0.1, 0.6
@@ -105,6 +106,15 @@ def test_fold_distance_is_the_log_ratio_to_the_nearest_fold(found: tuple[np.ndar
     np.testing.assert_allclose(inside, [np.log(1.0 / 0.9), -np.log(1.2)])
 
 
+@pytest.mark.parametrize(
+    ("error", "why"), [(KinematicSidebands(ratio=50.0), "longer period"), (KinematicHarmonic(n=6.0), "up to 5")]
+)
+def test_kinematic_errors_that_the_balance_can_not_carry_are_refused(error: MeshGeometryEffect, why: str):
+    at = Case(TwoInertiaModel(case().drive, (error,)))
+    with pytest.raises(ValueError, match=why):
+        PeakError(0.2, 0.9, rotating=True).refuse(at)
+
+
 @pytest.mark.slow
 def test_peak_error_and_mesh_torque_under_kinematic_error_agree_with_closed_form():
     """`x'' + mu (x' + e') + (x + e) = 0`, e = E cos 2 theta_m at the speed of the motor: amplitude and mesh torque."""
@@ -115,5 +125,8 @@ def test_peak_error_and_mesh_torque_under_kinematic_error_agree_with_closed_form
     found = eqx.filter_jit(PeakError(0.2, 0.9, rotating=True))(at)
     # The error's slope moves the motor's share of the torque: of order E N.
     assert float(found) == pytest.approx(size.max(), rel=0.02)
-    torque = eqx.filter_jit(MeshTorque(0.2, 0.9, rotating=True))(at)
-    assert float(torque) == pytest.approx(size.max(), rel=0.02)
+    # The mesh is twisted by x + e, far below the resonance by much less than x.
+    twist = E * w**2 / np.abs(1.0 - w**2 + 1j * MU * w)
+    for fast in (0.9, 0.25):
+        torque = eqx.filter_jit(MeshTorque(0.2, fast, rotating=True))(at)
+        assert float(torque) == pytest.approx(twist[speeds <= fast].max(), rel=0.02)

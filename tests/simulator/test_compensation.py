@@ -55,6 +55,18 @@ def test_feedforward_removes_the_error_and_tolerates_two_percent_of_model_error(
     assert reduction(near, target) > 5.0
 
 
+def test_torque_of_the_feedforward_allows_for_the_torque_constant():
+    exact, weak = (feedforward(plant, 60.0) for plant in (PLANT, PLANT.replace({"k_T": 0.9})))
+    np.testing.assert_allclose(weak.torque.cosine, exact.torque.cosine / 0.9, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(weak.correction.cosine, exact.correction.cosine, rtol=1e-9, atol=1e-12)
+
+
+def test_servo_turns_a_plant_with_a_torque_constant_and_memory():
+    plant = PLANT.with_effects(BoucWen(k=500.0, memory_twist=1e-4)).replace({"k_T": 0.9})
+    found = run_at_speed(plant, 60.0, TIMES[:501], STIFF)
+    assert float(found.states[-1, 0]) == pytest.approx(60.0 * TIMES[500], rel=1e-3)
+
+
 def test_feedforward_of_the_angle_alone_suffices_for_a_stiff_servo():
     correction = feedforward(PLANT, 60.0)
     assert reduction(correction, "dynamic_error", servo=STIFF, use=("motor_angle",)) > 10.0

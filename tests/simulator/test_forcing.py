@@ -74,6 +74,13 @@ def test_multisine_has_its_rms_period_and_band(seed, rms, first, more):
     np.testing.assert_allclose(spectrum[~inside], 0.0, atol=1e-12 * n)
 
 
+def test_edges_of_the_band_are_lines_of_the_multisine():
+    """10 Hz is the 30th line of 3 s, though not to the last bit."""
+    edge = 2 * np.pi * 10.0
+    made = random_phase_multisine(rms=1.0, omega_min=edge, omega_max=edge, period=3.0, key=jax.random.key(0))
+    np.testing.assert_allclose(made.omegas, [edge])
+
+
 def test_multisine_phases_depend_on_the_key():
     band = {"rms": 1.0, "omega_min": 1.0, "omega_max": 50.0, "period": 2.0}
     one, same, other = (random_phase_multisine(**band, key=jax.random.key(k)) for k in (0, 0, 1))
