@@ -25,8 +25,10 @@ is registered before it begins: no rule was changed between the draw of its seed
 this page, which `benchmarks/undeclared/page.py` generates.
 
 Up to seed 8215 the strengths of quick creep are far too large: what a larger K absorbs of it was computed to first
-order only. Some of it can't be told from a larger K. Up to seed 3307 coloured noise enters the detection limits by its rms:
-an effect of slow motion beside it has up to five times fewer limits than the tables say.
+order only. Some of it can't be told from a larger K.
+
+Up to seed 3307 coloured noise enters the detection limits by its rms: beside it an effect of slow motion has up to five
+times fewer limits than the tables say.
 """
 
 

@@ -37,17 +37,14 @@ class Prediction:
         rows: Of the run that are rows of the log.
         zero: Offset that was subtracted from the measured dynamic error; the predicted one includes it.
         findings: On the log.
+        is_judged: Whether outputs are known beyond those that the run starts from.
     """
 
     run: FreeRun
     rows: np.ndarray | slice
     zero: float
     findings: tuple[Finding, ...]
-
-    @property
-    def is_judged(self) -> bool:
-        """Whether outputs are known beyond those that the run starts from."""
-        return bool(self.run.counts[WINDOW:].any())
+    is_judged: bool
 
     @property
     def table(self) -> pl.DataFrame:
@@ -128,13 +125,15 @@ def predict(model: AnyModel, data: Data) -> Prediction:
         raise InputError(f"a prediction follows one log, but there are {len(data.logs)}; load it alone")
     stored, name = _stored(model)
     log = data.ready(data.logs[0], outputs_until=WINDOW)
-    known = log
+    known = None
     if data.outputs_until is None:
         known = replace(counted_from(masked(data.logs[0]), log.zero), pieces=None)
+        # Doubled rows may be told by the later outputs alone.
+        known = known if np.array_equal(known.time, log.time) else None
     (run,), rows = _runs(stored, name, data, log, judged=known)
     if not np.isfinite(run.predicted).all():
         raise DataError(f"{log.path}: the model's free run diverges; check the torque column's unit and sign")
-    return Prediction(run, rows, log.zero, log.findings)
+    return Prediction(run, rows, log.zero, log.findings, known is not None)
 
 
 def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
@@ -204,7 +203,8 @@ def _runs(
             f"{log.path}: there is no temperature, on which {warm[0]} of {name} depends; add the column, or name it in "
             f"[columns] temperature of {data.drive.path}"
         )
-    along, known = (whole(experiments(one, data.drive, stored.hold)) for one in (log, judged or log))
+    along = whole(experiments(log, data.drive, stored.hold))
+    known = None if judged is None else whole(experiments(judged, data.drive, stored.hold))
     how = {"covariance": stored.noise, "halo": stored.halo, "substeps": stored.substeps}
     runs = free_run(stored.model, along, judged=known, **how)
     rows = along[0].experiment.rows

@@ -247,17 +247,19 @@ def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[flo
     None where free runs are inconclusive: the preceding model diverges, or neither it nor a trial follows the drive for
     long.
     """
-    old = _free_runs(before, study)
-    before_long, after_long = rms_error(old), long_errors(trials, study)
-    moves = float(np.std(np.concatenate([run.measured for run in old])))
-    if not np.isfinite(before_long) or min(before_long, *after_long) > 0.5 * moves:
+    errors = long_errors([before, *trials], study)
+    if errors is None or not np.isfinite(errors[0]):
         return None
+    before_long, *after_long = errors
     return [float(np.log(before_long) - np.log(after)) for after in after_long]
 
 
-def long_errors(trials: Sequence[Trial], study: Study) -> list[float]:
-    """Rms errors of free runs along whole held-out stretches; infinite where one diverges."""
-    return [rms_error(_free_runs(trial, study)) for trial in trials]
+def long_errors(trials: Sequence[Trial], study: Study) -> list[float] | None:
+    """Rms errors of free runs along whole held-out stretches, infinite where one diverges. None where none of them
+    follows the drive for long, as where its motion is chaotic."""
+    runs = [_free_runs(trial, study) for trial in trials]
+    errors, moves = [rms_error(own) for own in runs], float(np.std(np.concatenate([r.measured for r in runs[0]])))
+    return errors if min(errors) <= 0.5 * moves else None
 
 
 def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:

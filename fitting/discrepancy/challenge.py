@@ -88,10 +88,9 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         return Challenge(base, beside, left, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
-        with_names, replaced = long_errors([rival, instead.trial], study)
-        # Where both diverge, neither is worse.
-        both = np.isinf(with_names) and np.isinf(replaced)
-        seen = replace(seen, longer_worse=0.0 if both else float(np.log(replaced) - np.log(with_names)))
+        errors = long_errors([rival, instead.trial], study)
+        worse = 0.0 if errors is None else float(np.log(errors[1]) - np.log(errors[0]))
+        seen = replace(seen, longer_worse=worse)
     if instead is not None and beside is not None:
         names = {e.name for e in named.model.effects}
         seen = replace(

@@ -47,7 +47,8 @@ def with_own_clocks(
         InputError: A clock is missing or invalid, or a name is not unique.
     """
     clocks = _repeated_clocks(table, drive_file.column_of("time").column)
-    in_turn = _come_in_turn(raw)
+    if not clocks and all(drive_file.column_of(s).time is None and c.time is None for s, c in raw.items()):
+        return _merged(raw), ()
     found, findings = dict(raw), []
     for signal, column in raw.items():
         place = drive_file.column_of(signal)
@@ -58,10 +59,6 @@ def with_own_clocks(
             stamps, unit = _stamps(path, drive_file, table, signal, name)
         elif column.time is not None:
             stamps, unit = column.time, "s"
-        elif in_turn:
-            stamps, unit = channel(path, drive_file, "time", raw["time"]).values, raw["time"].unit
-            name = drive_file.column_of("time").column
-            column, stamps = _filled(column, stamps)
         else:
             continue
         found[signal], mended = _clocked(path, drive_file, signal, column, stamps, name or place.column, unit)
@@ -72,24 +69,24 @@ def with_own_clocks(
     return found, tuple(findings)
 
 
-def _come_in_turn(raw: Mapping[str, RawColumn]) -> bool:
-    """Whether rows with the same stamp hold different signals, as where logs of several senders are put in one table:
-    they are samples of one instant, and not repeated rows."""
-    if "time" not in raw:
-        return False
-    stamps, known = raw["time"].values, [np.isfinite(c.values) for s, c in raw.items() if s != "time"]
-    if any(len(own) != len(stamps) for own in known):
-        return False
-    same = np.diff(stamps) == 0.0
-    return bool(same.any()) and not any((own[1:] & own[:-1])[same].any() for own in known)
+def _merged(raw: Mapping[str, RawColumn]) -> dict[str, RawColumn]:
+    """The columns with one row an instant, where rows with the same stamp hold different signals, as in a table of
+    several senders' messages."""
+    if "time" not in raw or len({len(column.values) for column in raw.values()}) > 1:
+        return dict(raw)
+    same = np.diff(raw["time"].values) == 0.0
+    place = np.concatenate(([0], np.cumsum(~same)))
+    known = {signal: np.isfinite(column.values) for signal, column in raw.items() if signal != "time"}
+    if not same.any() or any(np.bincount(place[own]).max(initial=0) > 1 for own in known.values()):
+        return dict(raw)
 
+    def one(signal: str, column: RawColumn) -> RawColumn:
+        own = known.get(signal, slice(None))
+        values = np.full(place[-1] + 1, np.nan)
+        values[place[own]] = column.values[own]
+        return replace(column, values=values, text_rows=np.unique(place[column.text_rows]))
 
-def _filled(column: RawColumn, stamps: np.ndarray) -> tuple[RawColumn, np.ndarray]:
-    """A column without its blank rows, and the stamps of the others."""
-    known = np.isfinite(column.values)
-    known[column.text_rows] = True
-    kept = replace(column, values=column.values[known], text_rows=np.cumsum(known)[column.text_rows] - 1)
-    return kept, stamps[known]
+    return {signal: one(signal, column) for signal, column in raw.items()}
 
 
 def _repeated_clocks(table: RawTable, name: str) -> dict[int, str]:

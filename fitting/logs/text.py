@@ -10,7 +10,7 @@ from fitting.errors import InputError
 from fitting.logs.lvm import MAGIC, lvm_table
 from fitting.logs.plain_numbers import plain_columns
 from fitting.logs.raw_table import RawColumn, RawTable, numbered, places_of, split_unit
-from fitting.logs.units import USUAL
+from fitting.logs.units import USUAL, is_unit
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
@@ -77,6 +77,9 @@ class Head:
         columns = {}
         for name, place in self.places(wanted).items():
             stated = split_unit(self.names[place])[1]
+            # What stands behind a name that is stated in full may be an explanation.
+            if stated is not None and self.names[place] == name and not is_unit(stated):
+                stated = None
             below = self.units[place] if place < len(self.units) else None
             columns[name] = replace(found[place], unit=found[place].unit or stated or below or None)
         plain = [split_unit(name)[0] for name in self.names]

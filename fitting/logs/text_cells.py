@@ -12,11 +12,11 @@ from fitting.logs.units import UnitError, convert
 _BLANKS = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "?", "nil", "missing")
 _SECONDS_A_DAY = 86400.0
 _MOST_UNITS = 8
-# With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
 # Groups of three digits; no number begins with a zero before them.
 _THOUSANDS = r"^[-+]?[1-9][0-9]{{0,2}}({0}[0-9]{{3}})+$"
 # Largest share of stamps that may be incomplete.
 _TORN = 0.05
+# With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
 
 

@@ -161,6 +161,15 @@ def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
         raise UnitError(f"unit {unit!r} does not convert to {target!r}") from error
 
 
+def is_unit(text: str) -> bool:
+    """Whether a text is the name of a unit."""
+    try:
+        to_base(np.array(1.0), text)
+    except UnitError:
+        return False
+    return True
+
+
 def to_base(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     """Values in coherent SI units, and that unit's name.
 

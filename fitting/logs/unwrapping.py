@@ -22,7 +22,15 @@ def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, 
     spans = [revolution]
     if _whole(values, 1.0):
         spans += [2.0**bits for bits in _BITS]
+    ordered = np.sort(values[np.isfinite(values)])
+    if len(ordered) < 3:
+        return values, 0.0, np.zeros(0, dtype=int)
+    # Nearly all samples of a wrapped angle are within one span, and they fill it.
+    most = int(_RARE * len(ordered))
+    narrowest = np.min(ordered[len(ordered) - 1 - most :] - ordered[: most + 1])
     for span in sorted(spans):
+        if np.ptp(ordered) <= 0.5 * span or narrowest > span * (1 + _FINEST):
+            continue
         counted = values.copy()
         counted[_lone(values, span)] = np.nan
         jumps = _jumps(counted, span)

@@ -98,8 +98,10 @@ def _fewest_steps(
     while substeps <= min(most, max(1.0, turns) * _MOST_STEPS_PER_TURN) and rises < 3:
         tried = dataclasses.replace(route, substeps=substeps)
         errors, _ = _errors(transients(case, request, tried, values), truth)
-        worst = float(np.max(errors, initial=0.0))
-        if errors.size and worst <= _SAFETY * request.tolerance:
+        if not errors.size:
+            return None
+        worst = float(np.max(errors))
+        if worst <= _SAFETY * request.tolerance:
             return tried
         # Rounding errors don't decrease with the step.
         rises = rises + 1 if worst > 0.9 * least and worst < 0.1 else 0

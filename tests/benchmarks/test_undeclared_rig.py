@@ -286,6 +286,13 @@ def test_detectability_of_one_wrong_sample_agrees_with_the_closed_form(memory: f
     assert found == pytest.approx(distance * np.sqrt(0.2) / LIMIT, rel=0.05)
 
 
+def test_diverging_motion_is_detectable_without_limit():
+    states, _ = integrate(BASE, np.zeros(4), random_torque(400), dt=DT, substeps=20)
+    readings = np.column_stack(read_encoders(BASE, states))
+    readings[200:] = np.nan
+    assert detectability(BASE, [(states, readings, random_torque(400), np.zeros(400))], encoders=WHITE, dt=DT) == np.inf
+
+
 def test_encoder_noise_has_its_rms_and_colour():
     random = np.random.default_rng(0)
     for encoders in (Encoders((1e-5, 1e-6), (0.0, 0.0), 0.9), Encoders((1e-5, 1e-6), (2e-5, 2e-6), 0.0)):

@@ -97,6 +97,19 @@ def test_signals_that_come_in_turn_share_their_stamps(tmp_path: Path):
     assert log.trusted is None and log.pieces is None
 
 
+def test_blank_row_of_an_ordinary_log_gives_no_clocks(tmp_path: Path):
+    """Of an instant that is logged already, beside a slow load encoder."""
+    rows = ["Time,Motor,Load,Torque"]
+    for i, (t, *values) in enumerate(np.stack([TIME, MOTOR, FINE[::5, 1], TORQUE], axis=1).tolist()):
+        motor, load, torque = (repr(v) for v in values)
+        rows.append(f"{t!r},{motor},{'' if i % 50 == 7 else load},{torque}")
+        rows += [f"{t!r},,,"] if i == 400 else []
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    log = read_log(tmp_path / "log.csv", drive(tmp_path))
+    np.testing.assert_array_equal(log.time, TIME)
+    np.testing.assert_array_equal(log.motor_angle, MOTOR)
+
+
 def test_only_the_time_common_to_all_signals_is_kept(tmp_path: Path):
     path = save(tmp_path, [(TIME[:1500], MOTOR[:1500]), (TIME[100:], FINE[::5, 1][100:]), (TIME, TORQUE)])
     log = read_log(path, drive(tmp_path))
