@@ -113,7 +113,7 @@ def _both(ratios: tuple[float, float] | None) -> dict[str, float | None]:
 def _tie_says(found: str, separation: Separation) -> str:
     rival, logs, proposed = separation.rival, separation.on_logs, separation.proposed
     if proposed is None:
-        if not is_decided(logs):
+        if logs is None or not is_decided(logs):
             return f"{rival} is not smooth enough for a gradient search: no command was searched against it."
         return (
             f"Simulations as long as the logs already separate {found} and {rival}, with expected log-likelihood "
