@@ -102,7 +102,7 @@ def test_diverged_fit_has_a_report(fitted: FitOnly, tmp_path: Path):
     assert found["goodness"]["band_coverage"] is None
     assert any("diverges" in sentence for sentence in found["meaning"])
     assert "n/a" in report_text(found)
-    assert "diverged" in write_page(tmp_path, broken)
+    assert "its free run diverges" in write_page(tmp_path, broken)
 
 
 def test_text_report_of_a_fit_lists_sections_and_parameters(fitted: FitOnly):

@@ -150,9 +150,22 @@ def test_summary_of_a_sufficient_model_tells_drifting_free_runs_from_noise(loop:
     assert said.startswith("The model suffices: over short segments it leaves only noise, and none") is drifts
 
 
-def test_side_on_which_something_is_missing_is_told(loop: Loop):
-    found = report_dict(Loop(**{**vars(loop), "decision": "unexplained", "parameters_from": "motor equation"}))
-    assert "is missing on the load that the catalogue does not explain" in found["summary"]
+@pytest.mark.parametrize(
+    ("limited", "why"), [(False, " that the catalogue does not explain."), (True, ": --max-effects ended the search.")]
+)
+def test_side_on_which_something_is_missing_is_told(loop: Loop, limited: bool, why: str):
+    changed = {"decision": "unexplained", "parameters_from": "motor equation", "limited": limited}
+    found = report_dict(Loop(**{**vars(loop), **changed}))
+    assert f"is missing on the load{why}" in found["summary"]
+    assert "depends on none of the quantities" in found["summary"]
+    assert found["search_limited"] is limited
+
+
+def test_learned_term_beside_names_is_told_with_them(loop: Loop):
+    """The error falls by all of them together."""
+    report = report_dict(Loop(**{**vars(loop), "decision": "unexplained"}))
+    report["unknown"] = {"place": "load", "variables": ["theta_l"], "period": None, "memory": None}
+    assert "Together with a learned torque on the load" in summary(report)
 
 
 @pytest.mark.parametrize(("family", "told"), [("load_disturbance", True), ("motor_friction", False)])
