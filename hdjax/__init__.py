@@ -8,9 +8,10 @@ if sys.argv[0] == "-m":
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.dynamics import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, ReducedModel, TwoInertiaModel
+from hdjax.dynamics import Model, ReducedModel, TwoInertiaModel
 from hdjax.forcing import Chirp, Harmonic, MultiHarmonic, random_phase_multisine
 from hdjax.fourier import FourierSeries, fourier_series, harmonic_series
+from hdjax.one_side import LoadDrivenModel, MotorDrivenModel, OneSideModel
 from hdjax.presets import PRESETS, hdc_40_050
 from hdjax.results import Ending, SimulationError
 from hdjax.signals import HOLDS, Hold, PiecewisePolynomial, sampled

@@ -105,13 +105,9 @@ def feedforward(
             ],
             axis=1,
         )
-
-        def rates_under(torque: float) -> Array:
-            loads = jnp.full(samples, 1.0) * load_torque
-            return jax.vmap(model.rates)(states, jnp.full(samples, torque), loads)
-
+        no_torque, loads = jnp.zeros_like(t), jnp.full(samples, 1.0) * load_torque
         # The motor's acceleration is linear in the torque.
-        free, pushed = rates_under(0.0), rates_under(1.0)
+        free, pushed = (jax.vmap(model.rates)(states, no_torque + unit, loads) for unit in (0.0, 1.0))
         lacking = (drive.N * (x_2 + y_2) - free[:, 2]) / (pushed - free)[:, 2]
         return jnp.stack([drive.J_l * (y_2 - free[:, 3]), lacking])
 

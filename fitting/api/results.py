@@ -138,9 +138,7 @@ class Result:
             proposed = experiment_for_ties(outcome, limits, progress=progress)
         else:
             proposed = experiment_for_alpha(outcome, self.rig.experiments[outcome.hold], limits, progress=progress)
-        told = Report.of_rig(outcome, self.rig, next_experiment=proposed)
-        told.content["next_experiment_sought"] = True
-        return replace(self, told=told)
+        return replace(self, told=Report.of_rig(outcome, self.rig, next_experiment=proposed, sought=True))
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `report.json`."""

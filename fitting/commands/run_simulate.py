@@ -1,6 +1,5 @@
 """Implementation of `hdjax simulate`."""
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from fitting.commands.table import write_table
 from fitting.errors import InputError
 from fitting.stored_model import read_model
 from hdjax import PRESETS, Chirp, Harmonic, TwoInertiaModel, random_phase_multisine, sampled, simulate
-from hdjax.dynamics import BOTH_ANGLES
+from hdjax.dynamics import reading_both_angles
 
 
 def write_simulation(
@@ -35,9 +34,7 @@ def write_simulation(
     if preset not in PRESETS:
         raise InputError(f"--preset must be one of {', '.join(PRESETS)}, but is {preset}")
     system = TwoInertiaModel(PRESETS[preset]()) if model is None else read_model(model).model
-    if isinstance(system, TwoInertiaModel):
-        # Both angles are written, whatever was measured in the log that the model is from.
-        system = dataclasses.replace(system, measured=BOTH_ANGLES)
+    system = reading_both_angles(system)
     warm = [e.name for e in system.effects if e.needs_temperature]
     if warm:
         raise InputError(f"{model}: {warm[0]} needs a temperature, which a simulation of a torque lacks")

@@ -46,7 +46,7 @@ _RATE_TOLERANCE = 0.03
 _ABOUT_ONE = 0.15  # limits of reduction ratios
 _WHOLE_TOLERANCE = 2e-3
 _COPY = 5.0  # odds of proportionality above which two columns are the same channel
-_MOST_FRAMES = 2000  # assignments of angles for which the other columns are assigned
+_MOST_FRAMES = 2000  # likeliest assignments of angles that are weighed with the other columns; all of twelve columns
 _NEARLY = 12.0  # hypotheses less likely than the best by this much are dropped
 
 

@@ -13,7 +13,7 @@ from fitting.logs.raw_table import RawColumn
 _NOTICED = 0.01
 _SPOILT = 0.2
 _RESOLVED = 0.3
-_PAUSE = 2.5  # times the usual step
+_PAUSE = 2.5  # times the usual step, assumed: more than one sample is missing
 _SAME = 1e-4  # of a step; stamps closer than this are equal for a fit
 
 
@@ -98,9 +98,8 @@ def angles_together(
     inside = (at >= time[known][0]) & (at <= time[known][-1])
     # A cubic does not span a pause of the quicker encoder.
     own = np.diff(time[known])
-    inside &= own[np.clip(np.searchsorted(time[known], at, side="right") - 1, 0, len(own) - 1)] < _PAUSE * np.median(
-        own
-    )
+    place = np.clip(np.searchsorted(time[known], at, side="right") - 1, 0, len(own) - 1)
+    inside &= own[place] < _PAUSE * np.median(own)
     moved = np.full(len(time), np.nan)
     moved[np.flatnonzero(wanted)[inside]] = spline(at[inside])
     # Half of the samples predict the other half; the error of a cubic decreases sixteenfold with half the step, if the

@@ -14,7 +14,7 @@ _SECONDS_A_DAY = 86400.0
 _MOST_UNITS = 8
 # Groups of three digits; no number begins with a zero before them.
 _THOUSANDS = r"^[-+]?[1-9][0-9]{{0,2}}({0}[0-9]{{3}})+$"
-# Largest share of stamps that may be incomplete.
+# Largest share of stamps that may be incomplete, assumed.
 _TORN = 0.05
 # With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")

@@ -5,7 +5,7 @@ import numpy as np
 _BITS = (8, 10, 12, 13, 14, 16, 17, 18, 19, 20, 21, 22, 23, 24, 31, 32)
 _OVERFLOWS = (12, 16, 32)
 _FINEST = 1e-9
-# Largest share of samples that may be wrong one by one.
+# Largest share of samples that may be wrong one by one, assumed.
 _RARE = 0.01
 
 
@@ -32,7 +32,7 @@ def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, 
         if np.ptp(ordered) <= 0.5 * span or narrowest > span * (1 + _FINEST):
             continue
         counted = values.copy()
-        counted[_lone(values, span)] = np.nan
+        counted[_lone(values, ordered, span)] = np.nan
         jumps = _jumps(counted, span)
         if jumps is None:
             continue
@@ -85,20 +85,24 @@ def _turned(values: np.ndarray, jumps: np.ndarray, span: float) -> np.ndarray:
     return span * np.concatenate(([0.0], np.cumsum(turns)))
 
 
-def _lone(values: np.ndarray, span: float) -> np.ndarray:
+def _lone(values: np.ndarray, ordered: np.ndarray, span: float) -> np.ndarray:
     """Rows of single wrong samples: off from both neighbours, or outside the one span that holds nearly all samples,
-    where the neighbours agree."""
+    where the neighbours agree.
+
+    Args:
+        values: as logged, NaN where unknown, (n,).
+        ordered: the known ones in rising order, three at least.
+        span: of a jump.
+    """
     rows = np.flatnonzero(np.isfinite(values))
     known = values[rows]
-    if len(rows) < 3:
-        return rows[:0]
 
     def apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         step = one - other
         return np.abs(step - span * np.rint(step / span))
 
     before, own, after = known[:-2], known[1:-1], known[2:]
-    ordered, width = np.sort(known), span * (1 + _FINEST)
+    width = span * (1 + _FINEST)
     low = ordered[np.argmax(np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered)))]
     outside = (known < low) | (known > low + width)
     off = outside[1:-1] | (np.minimum(apart(own, before), apart(after, own)) > span / 8)

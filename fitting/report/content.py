@@ -39,6 +39,7 @@ def report_dict(
     health: Sequence[tuple[str, findings.Finding]] = (),
     name: str = "drive",
     next_experiment: NextExperiment | None = None,
+    sought: bool = False,
 ) -> dict[str, Any]:
     """The content of `report.json`: finite numbers and nulls only.
 
@@ -48,6 +49,7 @@ def report_dict(
         health: findings of the health check, each with its log's name.
         name: of the drive.
         next_experiment: the proposed experiment.
+        sought: whether an experiment was searched for, even if none was found.
     """
     units = {"dynamic_error": "rad", "forcing": "N m"} | units_of_outputs(outcome.stored) | dict(units or {})
     noise = noise_of_outputs(outcome.stored)
@@ -85,7 +87,7 @@ def report_dict(
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
         "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
-        "next_experiment_sought": next_experiment is not None,
+        "next_experiment_sought": sought,
         "hold": outcome.hold,
         "setting": None,
         **_circumstances(outcome),

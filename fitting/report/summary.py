@@ -11,7 +11,7 @@ from fitting.report.unknown import place_and_variables
 
 # Smallest relative change of the error that is stated.
 _HARDLY = 0.1
-# Share of the residual below which it does not depend on a quantity.
+# Share of the residual below which it does not depend on a quantity, assumed: a tenth of its rms.
 _NO_SHARE = 0.01
 
 # A temperature from zero kelvin differs by parts of a kelvin only in its fourth digit.

@@ -55,17 +55,20 @@ class Report:
         Args:
             outcome: of the loop or of a fit.
             next_experiment: the proposed experiment.
-            told: units, health findings and name of the drive, see [`report_dict`][].
+            told: units, health findings and name of the drive, and whether an experiment was sought; see
+                [`report_dict`][].
         """
         content = report_dict(outcome, next_experiment=next_experiment, **told)
         return cls(outcome, content, _pictures(outcome, content, next_experiment), next_experiment)
 
     @classmethod
-    def of_rig(cls, outcome: Outcome, rig: Rig, *, next_experiment: NextExperiment | None = None) -> "Report":
-        """Make the report of an outcome of a rig's logs."""
+    def of_rig(
+        cls, outcome: Outcome, rig: Rig, *, next_experiment: NextExperiment | None = None, sought: bool = False
+    ) -> "Report":
+        """Make the report of an outcome of a rig's logs; arguments as in [`report_dict`][]."""
         health = [(log, finding) for log, found in rig.findings.items() for finding in found]
         told = {"units": rig.logs[0].units, "health": health, "name": rig.name}
-        return cls.of(outcome, next_experiment=next_experiment, **told)
+        return cls.of(outcome, next_experiment=next_experiment, sought=sought, **told)
 
     @property
     def text(self) -> str:

@@ -16,10 +16,10 @@ from hdjax.design.steady import (
     HARMONICS,
     Range,
     balanced,
-    error_swing,
     followed,
     largest_swing,
     motions_at,
+    swing,
     with_system,
 )
 from hdjax.drive import restoring
@@ -121,7 +121,7 @@ class MeshTorque(ResponseMeasure):
     rotating: bool = False
 
     def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
-        size = functools.partial(mesh_twist, case.model) if self.rotating else error_swing
+        size = functools.partial(mesh_twist, case.model) if self.rotating else swing
         return case.drive.K * restoring(largest_swing(system, self.looked_at, branches, size)[0], case.drive.alpha)
 
 

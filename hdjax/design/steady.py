@@ -92,14 +92,10 @@ def with_system(branch: Branch, system: BalancedMotion) -> Branch:
     return eqx.tree_at(lambda b: b.system, branch, system)
 
 
-def swing(x: FourierSeries) -> Float[Array, ""]:
-    """Largest distance of a dynamic error from its mean [rad]."""
+def swing(motion: SteadyState) -> Float[Array, ""]:
+    """Largest distance of the dynamic error from its mean [rad]."""
+    x = motion.x
     return FourierSeries(x.omega, jnp.zeros_like(x.mean), x.cosine, x.sine).largest()
-
-
-def error_swing(motion: SteadyState) -> Float[Array, ""]:
-    """[`swing`][] of a motion."""
-    return swing(motion.x)
 
 
 def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> SteadyState:
@@ -115,7 +111,7 @@ def largest_swing(
     system: BalancedMotion,
     looked_at: Range,
     branches: Branch,
-    size_of: Callable[[SteadyState], Float[Array, ""]] = error_swing,
+    size_of: Callable[[SteadyState], Float[Array, ""]] = swing,
 ) -> tuple[Float[Array, ""], SteadyState]:
     """The largest swing, or another size, of all steady motions found in a range, stable or not, and the motion.
 

@@ -1,6 +1,5 @@
 """Execution of a sweep: chunk by chunk, on this machine's devices or on the workers of a cluster."""
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 
 from hdjax.cluster import on_cluster
-from hdjax.dynamics import BOTH_ANGLES, Model, TwoInertiaModel
+from hdjax.dynamics import Model, reading_both_angles
 from hdjax.extra import required
 from hdjax.sweep.outputs import Plan, answers, extra_dims, plan, variables
 from hdjax.sweep.points import SAMPLE
@@ -61,10 +60,8 @@ def sweep(
         ImportError: the extra `sweep` is not installed.
     """
     required("xarray")
-    if isinstance(model, TwoInertiaModel):
-        # The response is that of the dynamic error, whatever was measured in the log that the model is from.
-        model = dataclasses.replace(model, measured=BOTH_ANGLES)
-    case = Case(model, forcing)
+    # The response is that of the dynamic error.
+    case = Case(reading_both_angles(model), forcing)
     case.require(request)
     begin = time.perf_counter()
     if store is None:
