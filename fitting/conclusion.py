@@ -92,10 +92,12 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
-        # Laws are not exact, which bands do not include. But what noise is said to explain must be within them.
-        much = not share_explained(at_first, runs, current.held_out, covariance) < RULES.free_run_explained
-        waived = much and left is None
-        seen = replace(seen, surprise=None if waived else surprise(fitted, runs, current.held_out, **known))
+        explained = share_explained(at_first, runs, current.held_out, covariance)
+        seen = replace(seen, free_runs_explained=explained)
+        # Bands are of first order: chaotic motion exceeds them, though short segments leave only noise.
+        much = explained is None or explained >= RULES.free_run_explained
+        if not (much and challenge.seen.enough):
+            seen = replace(seen, surprise=surprise(fitted, runs, current.held_out, **known))
         outcome, _ = conclude(seen)
         if outcome == "unexplained":
             # A learned term that follows long stretches may replace names that do not.

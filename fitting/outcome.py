@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from fitting.attribution.case_evidence import CaseEvidence
 from fitting.attribution.decisions import Check, Outcome
 from fitting.attribution.effect_evidence import Evidence
+from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Setting
 from fitting.discrepancy.learn import Unknown
@@ -128,8 +129,8 @@ class Loop(eqx.Module):
         setting: segmentation of the logs.
         after_substeps: solver steps in a sample interval of the final model.
         stretches: training and selection stretches.
-        surprise: error of free runs along selection stretches over their bands, where accepted effects do not explain
-            it and no learned term is better; None otherwise.
+        surprise: error of free runs along selection stretches over their bands, where effects were accepted that leave
+            more than noise, or do not explain them; None otherwise, or where bands diverge.
         parameters_from: "torque"; or the "load equation" or "motor equation" for K, alpha and B_sp of the final model,
             see [`fitting.one_side_check`][].
         put_back: time offset subtracted from each log's clock [s], so that a line is in phase.
@@ -169,6 +170,14 @@ class Loop(eqx.Module):
     def stored(self) -> StoredModel:
         """The final model, as `model.json` has it."""
         return StoredModel(self.after.model, self.hold, self.after_substeps, self.setting.halo, self.noise)
+
+    @property
+    def unknown_remains(self) -> bool:
+        """Whether something is missing that no name explains."""
+        if self.decision == "effect_found":
+            drifts = self.surprise is not None and self.surprise > RULES.surprise
+            return self.unknown is not None or self.times_noise >= RULES.excess or drifts
+        return self.decision == "unexplained"
 
     @property
     def times_noise(self) -> float:

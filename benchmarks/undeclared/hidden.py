@@ -464,6 +464,10 @@ FORMS = (
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))
 
+EQUAL = {"torque_sensor": "inertia_error", "input_delay": "sensor_delay"}
+"""Families with the very equations of another one: a gain of the torque changes both inertias, K, alpha and B_sp by one
+factor; a torque that comes late is an experiment whose two encoders read late."""
+
 
 def forms_of(family: str) -> tuple[Form, ...]:
     """The forms of a family."""

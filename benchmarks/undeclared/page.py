@@ -28,7 +28,8 @@ Up to seed 8215 the strengths of quick creep are far too large: what a larger K 
 order only. Some of it can't be told from a larger K.
 
 Up to seed 3307 coloured noise enters the detection limits by its rms: beside it an effect of slow motion has up to five
-times fewer limits than the tables say.
+times fewer limits than the tables say. And where a family was left out, one with the same equations remained in the
+catalogue, and counted as wrong: wrong inertias for a gain of the torque, late encoders for a late torque.
 """
 
 

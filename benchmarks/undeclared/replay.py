@@ -39,6 +39,7 @@ OFF: Mapping[str, float] = {
     "noise_gain": -np.inf,
     "innovations": np.inf,
     "surprise": np.inf,
+    "free_run_explained": -np.inf,
 }
 
 

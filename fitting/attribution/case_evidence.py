@@ -170,7 +170,9 @@ class FinalEvidence:
             the noise.
         excess_at_first: likewise of the base model.
         noise_explains: whether coloured noise of sensors and torque explains the residual.
-        surprise: free-run error over its prediction band; None where that is not checked.
+        surprise: free-run error over its prediction band; None where that is not checked, or the band diverges.
+        free_runs_explained: share of the free runs' error beyond noise that the effects remove; None where that is not
+            checked, or all runs diverge.
         at_bounds: parameters of the named effects that ended at a bound in the final fit.
     """
 
@@ -180,6 +182,7 @@ class FinalEvidence:
     excess_at_first: tuple[float, ...]
     noise_explains: bool = False
     surprise: float | None = None
+    free_runs_explained: float | None = None
     at_bounds: int = 0
 
 

@@ -155,8 +155,9 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
 def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
     """Whether named effects are accepted: one check that holds is enough.
 
-    Named effects are rejected where a learned term in their place predicts selection data as well as one beside them.
-    It must also differ from the named effects, or predict far better with fewer parameters.
+    Named effects are rejected where a learned term in their place predicts selection data as well as one beside them,
+    or better than they do with fewer parameters. It must also differ from the named effects, or predict far better with
+    fewer parameters.
 
     Args:
         seen: the evidence.
@@ -174,8 +175,12 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
     come_out = seen.come_out >= rules.come_out and seen.shown
     simpler = (by_far and fewer > 0) or (seen.one_shape and fewer >= 0)
     if beside is not None and _adds_little(seen, rules):
-        added = seen.named.selection - beside.selection
-        return (Check("little", "gain of a learned term beside the names", added, rules.little, True),)
+        # Without the term beside them the names alone are compared.
+        better_by = seen.named.selection - instead.selection
+        as_good = better_by > rules.least_gain and seen.named.parameters > instead.parameters
+        if not as_good:
+            added = seen.named.selection - beside.selection
+            return (Check("little", "gain of a learned term beside the names", added, rules.little, True),)
     return (
         Check("little", "a learned term in their place predicts as well", better_by, -rules.least_gain, not as_good),
         Check(
@@ -236,12 +241,15 @@ def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome
     most = rules.at_bounds
     checks.append(Check("at_bounds", "final fit", float(seen.at_bounds), most, seen.at_bounds <= most))
     found = found and checks[-1].holds
-    if found and seen.surprise is not None:
-        as_promised = seen.surprise <= rules.surprise
-        checks.append(
-            Check("surprise", "error of free runs over their bands", seen.surprise, rules.surprise, as_promised)
-        )
-        found = as_promised
+    if found and seen.surprise is not None and seen.free_runs_explained is not None:
+        ratio, most = seen.surprise, rules.surprise
+        checks.append(Check("surprise", "error of free runs over their bands", ratio, most, ratio <= most))
+        found = checks[-1].holds
+        if not seen.noise_explains:
+            # Laws are not exact, which bands do not include. But what noise is said to explain must be within them.
+            share, least = seen.free_runs_explained, rules.free_run_explained
+            checks.append(Check("free_run_explained", "of free runs, likewise", share, least, share >= least))
+            found = found or checks[-1].holds
     return "effect_found" if found else "unexplained", tuple(checks)
 
 

@@ -97,7 +97,7 @@ def report_dict(
     report |= _of_loop(outcome, noise) if is_loop else fit_dict(outcome, noise[output])
     report = finite(report)
     if is_loop:
-        say_what_intervals_hold(report, outcome.times_noise)
+        say_what_intervals_hold(report)
     report["summary"] = summary(report)
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)
@@ -126,6 +126,8 @@ def _of_loop(outcome: Loop, noise: Mapping[str, Any]) -> dict[str, Any]:
     }
     return {
         "times_noise": outcome.times_noise,
+        "free_runs_times_expected": outcome.surprise,
+        "unknown_remains": outcome.unknown_remains,
         "rules": rules_dict(outcome.checks),
         "evidence": dataclasses.asdict(outcome.case),
         "noise": dict(noise) | {"memory": outcome.noise_memory, "torque": outcome.torque_noise},

@@ -62,7 +62,7 @@ def _figures(model: Model, x_max: float) -> dict[str, float]:
     return known | {name: float(value) for name, (value, _) in drive_figures(model, x_max).items()}
 
 
-def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
+def say_what_intervals_hold(report: dict[str, Any]) -> None:
     """Mark the intervals of the drive's parameters and derived figures under a large discrepancy; withhold them where
     that is not explained, or where a learned torque acts in the mesh.
 
@@ -71,10 +71,17 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
 
     Args:
         report: its content so far, with finite numbers only.
-        times_noise: residual of the final model over the measurement noise.
     """
     unexplained = report["decision"] == "unexplained"
-    much = times_noise >= RULES.excess
+    times_noise, beyond = report["times_noise"], report["free_runs_times_expected"]
+    left = "The model discrepancy is not explained"
+    much = True
+    if times_noise >= RULES.excess:
+        left = f"The model's residual is {formatting.number(times_noise)} times the noise"
+    elif beyond is not None and beyond > RULES.surprise:
+        left = f"Free runs err by {formatting.number(beyond)} times what noise and uncertainty allow"
+    else:
+        much = False
     learned = report.get("unknown") or {}
     names = formatting.words(list(report["before"]["parameters"]))
     if (learned.get("place"), learned.get("quantity"), report["parameters_from"]) == ("mesh", "torque", "torque"):
@@ -82,11 +89,6 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
         _mark(report["after"], note, withheld=True)
     if not (unexplained or much):
         return
-    left = (
-        f"The model's residual is {formatting.number(times_noise)} times the noise"
-        if much
-        else "The model discrepancy is not explained"
-    )
     end = "their intervals are withheld" if unexplained and much else "their intervals do not include that"
     note = f"{left}: {names} may be off by more than their standard errors, and {end}."
     # One side's own equation leaves no more than noise.

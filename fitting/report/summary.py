@@ -60,6 +60,8 @@ def _decision(report: Mapping[str, Any]) -> str:
             rest = f" Something unknown is also missing: {left}."
             if report["evidence"]["challenge"]["imperfect"]:
                 rest = f" {left.capitalize()}, which an inexact law of the effect may explain."
+        elif report["unknown_remains"]:
+            rest = f" Something unknown is also missing: free runs along selection data {_free_runs(report)}."
         several = bool(report["unknown"]) or len(families) > 1
         subject = "Together they" if several else "The effect" if rest else "It"
         change = _change(subject, report, several=several)
@@ -75,15 +77,8 @@ def _decision(report: Mapping[str, Any]) -> str:
         return f"{opening} {_change(f'Together with a {learned} it' if families else f'A {learned}', report)}"
     if report["evidence"]["final"]["at_bounds"]:
         return f"{opening} A parameter of what was found has ended at a bound: its law does not fit."
-    beyond = left["free_runs_times_expected"]
-    if beyond is not None and beyond > RULES.surprise:
-        told = (
-            f"{_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and uncertainty allow"
-        )
-        return (
-            f"{opening} Short segments hardly show it: free runs of whole stretches "
-            f"{'diverge' if after is None else f'err by {told}'}."
-        )
+    if report["free_runs_times_expected"] is not None:
+        return f"{opening} Short segments hardly show it: free runs along selection data {_free_runs(report)}."
     depends = f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)"
     if left["explained_share"] < _NO_SHARE:
         depends = "on none of the quantities that were examined"
@@ -150,6 +145,15 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
         where = f"short segments alone; over whole stretches of {on} data the error rises"
         return f"{subject} explain{s} {where} from {then} to {now}."
     return f"{subject} remove{s} {_removed(before, after)} of the error on {on} data, which falls from {then} to {now}."
+
+
+def _free_runs(report: Mapping[str, Any]) -> str:
+    _, unit, noise = principal(report)
+    after, beyond = report["after"]["rmse"]["selection"], report["free_runs_times_expected"]
+    if after is None:
+        return "diverge"
+    times = formatting.number(beyond)
+    return f"err by {_against_noise(after, noise, unit)}, {times} times what noise and uncertainty allow"
 
 
 def _count(number: int) -> str:

@@ -20,7 +20,6 @@ def unexplained(outcome: Outcome, noise: float) -> dict[str, Any] | None:
     return {
         "rms": residual.rms,
         "times_noise": residual.rms / noise,
-        "free_runs_times_expected": outcome.surprise,
         "depends_on": words.get(most, most),
         "explained_share": shares[most],
         "explained_shares": shares,

@@ -14,9 +14,9 @@ from fitting.uncertainty.standard_errors import uncertainty
 
 def share_explained(
     before: Sequence[FreeRun], after: Sequence[FreeRun], held_out: Fit, noise: Float[Array, "outputs outputs"]
-) -> float:
-    """Share of the variance beyond noise, of the base model's free runs, that the effects remove. NaN where both models
-    diverge.
+) -> float | None:
+    """Share of the variance beyond noise, of the base model's free runs, that the effects remove. None where both
+    models diverge.
 
     Args:
         before: free runs of the base model along the held-out stretches.
@@ -26,7 +26,8 @@ def share_explained(
     """
     variance = float(_short_error(held_out, noise)[-1, -1])
     at_first = max(rms_error(before) ** 2 - variance, np.finfo(float).tiny)
-    return 1.0 - (rms_error(after) ** 2 - variance) / at_first
+    share = 1.0 - (rms_error(after) ** 2 - variance) / at_first
+    return None if np.isnan(share) else share
 
 
 def surprise(

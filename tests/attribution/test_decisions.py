@@ -104,8 +104,10 @@ def test_simplest_plausible_candidate_leads_among_equal_gains():
         ({}, "effect_found"),
         ({"excess": (1.0, 4.0)}, "unexplained"),
         ({"excess": (1.0, 4.0), "noise_explains": True}, "effect_found"),
-        ({"surprise": 2.0}, "unexplained"),
-        ({"surprise": 1.1}, "effect_found"),
+        ({"surprise": 2.0, "free_runs_explained": 0.5}, "unexplained"),
+        ({"surprise": 2.0, "free_runs_explained": 0.95}, "effect_found"),
+        ({"surprise": 2.0, "free_runs_explained": 0.95, "noise_explains": True}, "unexplained"),
+        ({"surprise": 1.1, "free_runs_explained": 0.5}, "effect_found"),
         ({"names": ()}, "model_sufficient"),
         ({"names": (), "learned": True}, "unexplained"),
         ({"names": (), "excess": (1.0, 2.0)}, "unexplained"),
@@ -160,5 +162,5 @@ def test_replay_switches_off_existing_rules_and_reports_differences():
     assert differing(cases, replace(RULES, significance=1e-3)) == {
         "one": "round 1: another candidate would be accepted"
     }
-    unsure = replace(CASE, final=replace(FINAL, surprise=1.2))
+    unsure = replace(CASE, final=replace(FINAL, surprise=1.2, free_runs_explained=0.5))
     assert differing({"one": unsure}, replace(RULES, surprise=1.1)) == {"one": "effect_found -> unexplained"}

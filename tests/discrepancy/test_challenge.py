@@ -149,9 +149,24 @@ def test_names_stand_if_a_learned_term_beside_them_adds_little(training: float, 
     """Names that gain 2 on training data and 1 on selection data."""
     base, named = model(0.0), model(-1.0, training=-2.0)
     beside = model(-1.0 - selection, training=-2.0 - training)
-    instead = model(-3.0, parameters=1)
+    instead = model(-3.0, parameters=named.parameters)
     seen = ChallengeEvidence(base, named, 1, -9.0, False, beside, instead, ("instead", "beside"))
     assert any(check.holds for check in names_stand(seen)) == little
+
+
+@pytest.mark.parametrize(
+    ("better", "fewer", "come_out", "stand"),
+    [(0.02, 4, 0.0, False), (0.02, 0, 0.0, True), (0.0, 4, 0.0, True), (0.02, 4, 0.9, True)],
+)
+def test_names_fall_if_a_learned_term_predicts_better_with_fewer_parameters(
+    better: float, fewer: int, come_out: float, stand: bool
+):
+    """Sidebands of a kinematic error and a resonance, in place of an eccentric encoder that was left out."""
+    base, named = model(0.0), model(-1.87, parameters=10)
+    beside, instead = model(-1.90, parameters=12), model(-1.87 - better, parameters=10 - fewer)
+    asked = ("instead", "beside")
+    seen = ChallengeEvidence(base, named, 2, -2.05, False, beside, instead, asked, come_out=come_out)
+    assert any(check.holds for check in names_stand(seen)) == stand
 
 
 @pytest.fixture(scope="module")

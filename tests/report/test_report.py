@@ -136,9 +136,18 @@ def test_unexplained_residual_is_reported_with_its_dependence(loop: Loop):
 
 def test_unexplained_error_of_free_runs_is_reported(loop: Loop):
     found = report_dict(Loop(**{**vars(loop), "decision": "unexplained", "surprise": 1.4}))
-    assert found["unexplained"]["free_runs_times_expected"] == 1.4
+    assert found["free_runs_times_expected"] == 1.4
     assert "A part was found" in found["summary"]
     assert "1.40 times what noise and uncertainty allow" in found["summary"]
+    assert found["unknown_remains"]
+
+
+@pytest.mark.parametrize(("beyond", "remains"), [(None, False), (1.1, False), (1.4, True)])
+def test_free_runs_beyond_their_bands_are_reported_beside_an_effect(loop: Loop, beyond: float | None, remains: bool):
+    found = report_dict(Loop(**{**vars(loop), "surprise": beyond}))
+    assert found["unknown_remains"] == remains
+    assert ("Something unknown is also missing: free runs along selection data err by" in found["summary"]) == remains
+    assert (found["after"]["parameters"]["K"]["flag"] == "not covered") == remains
 
 
 @pytest.mark.parametrize(("times", "drifts"), [(1.05, False), (24.0, True)])

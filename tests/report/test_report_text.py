@@ -128,34 +128,38 @@ def _report_with_errors(
 
 
 @pytest.mark.parametrize(
-    ("decision", "times_noise", "withheld", "flagged"),
+    ("decision", "times_noise", "beyond", "withheld", "flagged"),
     [
-        ("effect_found", 1.1, False, False),
-        ("effect_found", 2.7, False, True),
-        ("unexplained", 44.0, True, True),
-        ("unexplained", 1.1, False, True),
+        ("effect_found", 1.1, None, False, False),
+        ("effect_found", 2.7, 1.0, False, True),
+        ("effect_found", 1.1, 4.0, False, True),
+        ("unexplained", 44.0, None, True, True),
+        ("unexplained", 1.1, None, False, True),
     ],
 )
-def test_intervals_are_withheld_or_flagged_where_the_residual_is_large(
-    decision: str, times_noise: float, withheld: bool, flagged: bool
+def test_intervals_are_withheld_or_flagged_where_the_residual_or_the_error_of_free_runs_is_large(
+    decision: str, times_noise: float, beyond: float | None, withheld: bool, flagged: bool
 ):
-    report = _uncertain_report(decision, None)
-    say_what_intervals_hold(report, times_noise)
+    report = _uncertain_report(decision, None, times_noise, beyond)
+    say_what_intervals_hold(report)
     K = report["after"]["parameters"]["K"]
     assert (K["ci95"] == [None, None]) == withheld == is_withheld(report["after"]["derived"]["omega_0"])
     assert (K["flag"] is not None) == (K["note"] is not None) == flagged
     assert not flagged or "K may be off" in K["note"]
 
 
-def _uncertain_report(decision: str, unknown: dict[str, str] | None) -> dict[str, Any]:
+def _uncertain_report(
+    decision: str, unknown: dict[str, str] | None, times_noise: float, beyond: float | None = None
+) -> dict[str, Any]:
     accounts = {"before": _account(), "after": _account()}
-    return {"decision": decision, "unknown": unknown, "parameters_from": "torque"} | accounts
+    known = {"times_noise": times_noise, "free_runs_times_expected": beyond}
+    return {"decision": decision, "unknown": unknown, "parameters_from": "torque"} | known | accounts
 
 
 @pytest.mark.parametrize("learned", [None, {"place": "mesh", "quantity": "torque"}])
 def test_intervals_of_one_side_are_stated_where_the_residual_is_large(learned: dict[str, str] | None):
-    report = _uncertain_report("unexplained", learned) | {"parameters_from": "load equation"}
-    say_what_intervals_hold(report, 44.0)
+    report = _uncertain_report("unexplained", learned, 44.0) | {"parameters_from": "load equation"}
+    say_what_intervals_hold(report)
     assert report["after"]["parameters"]["K"] == _account()["parameters"]["K"]
     assert is_withheld(report["before"]["parameters"]["K"])
 
@@ -165,8 +169,8 @@ def test_intervals_of_one_side_are_stated_where_the_residual_is_large(learned: d
 )
 def test_intervals_beside_a_learned_torque_in_the_mesh_are_withheld(place: str, quantity: str, withheld: bool):
     learned = {"place": place, "quantity": quantity}
-    report = _uncertain_report("unexplained", learned)
-    say_what_intervals_hold(report, 1.0)
+    report = _uncertain_report("unexplained", learned, 1.0)
+    say_what_intervals_hold(report)
     assert is_withheld(report["after"]["parameters"]["K"]) == withheld
     assert not is_withheld(report["before"]["parameters"]["K"])
 
