@@ -8,7 +8,7 @@
 # %% [markdown]
 # # How much damping?
 #
-# The source document's Table 3 says that more damping lowers the peak of the dynamic error, but "may affect
+# The seed document's Table 3 says that more damping lowers the peak of the dynamic error, but "may affect
 # efficiency". Here gradients find the mesh damping `B_sp` and the stiffness `K` that trade one for the other.
 #
 # The drive is the preset with a catalogue-like cubic stiffness. Its motor torque ripples by 0.5 N m. It works where the
