@@ -8,10 +8,10 @@
 # %% [markdown]
 # # The shortest log that tells alpha
 #
-# At small twist a drive is linear, and a log says nothing of the cubic coefficient. Which torque makes `alpha` known
+# At small twist a drive is linear, and a log does not determine the cubic coefficient. Which torque determines `alpha`
 # to 5 % from the shortest log, without twisting the gear beyond 1.2 mrad? Amplitude and frequency of a sine are the
-# variables. The time is that at which the standard error of `alpha` reaches 5 %, K, B_sp and the initial state being
-# fitted beside it: from sensitivities of the simulated log, before anything is measured.
+# variables. The objective is the time at which the standard error of `alpha` reaches 5 %. K, B_sp and the initial state
+# are fitted beside it. The error follows from sensitivities of the simulated log, before anything is measured.
 
 # %%
 import dataclasses
@@ -40,8 +40,8 @@ study = Study(
 )
 
 # %% [markdown]
-# Beats between the torque and the drive's own swing make many valleys, and the largest twist passes from one beat to
-# the next with a kink, where a search stalls. So many starts are worth their time.
+# Beats between the torque and the drive's free oscillation cause many local minima. The largest twist passes from one
+# beat to the next with a kink, where a search stalls. So the search has many starts.
 
 # %%
 found = optimise(study, 16)
@@ -60,8 +60,8 @@ print(f"gradients against differences: {proof.gradient_error:.1e}")
 assert proof.gain < 1e-3 and proof.gradient_error < 1e-3
 
 # %% [markdown]
-# The whole map shows why: the twist's limit cuts the valley at the resonance, which bends to the right. Beyond it, in
-# grey, the gear would be overloaded.
+# The map of all designs shows why: the fastest identification is at the resonance, which bends to the right, up to the
+# limit of the twist. Beyond it, in grey, the twist would be too large.
 
 # %%
 shares = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 25)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -8,8 +8,8 @@
 # %% [markdown]
 # # Close the loop with a log
 #
-# A drive hides an effect that its drive file does not mention. We fit what is declared, look at what is left over, let
-# the loop name the effect, and compare both models on the part of the logs that no fit has seen.
+# A drive hides an effect that its drive file does not mention. The loop fits the base model, names the effect, and
+# compares both models on the part of the logs that no fit has used.
 
 # %%
 from pathlib import Path
@@ -45,8 +45,8 @@ axes[2].set_ylabel("dynamic error [mrad]")
 axes[2].set_xlabel("time [s]")
 # %% [markdown]
 # ## The loop
-# No starting values: they come from the weak form of the equation of motion. The last 20 % of each log is test data, at
-# which only the figures at the end look.
+# Starting values come from the weak form of the equation of motion. The last 20 % of each log is test data, which only
+# the figures at the end use.
 
 # %%
 hold = rig.hold
@@ -74,7 +74,7 @@ axes[1].set_xlabel("time [s]")
 axes[1].legend(loc="upper right", ncols=2)
 # %% [markdown]
 # ## Was it right?
-# Only here do we look at the truth. Leaving the effect out had biased the drive's own parameters as well.
+# The truth is used only here. Without the effect the drive's own parameters are biased as well.
 
 # %%
 truth = hidden_truth()

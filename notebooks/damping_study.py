@@ -8,8 +8,8 @@
 # %% [markdown]
 # # How much damping?
 #
-# The seed document's Table 3 says that more damping lowers the peak of the dynamic error, but "may affect
-# efficiency". Here gradients find the mesh damping `B_sp` and the stiffness `K` that trade one for the other.
+# The seed document's Table 3 (`docs/seed_tables.md`) says that more damping lowers the peak of the dynamic error, but
+# "may affect efficiency". Here gradients find the mesh damping `B_sp` and the stiffness `K` with the best compromise.
 #
 # The drive is the preset with a catalogue-like cubic stiffness. Its motor torque ripples by 0.5 N m. It works where the
 # ripple's frequency is 1.6 to 2.4 times the preset's natural frequency, and passes the resonance on its way there.
@@ -44,8 +44,9 @@ RANGES = np.log([3.0, 10.0 / 0.3])
 # %% [markdown]
 # ## What Table 3 says, and what the model says
 # Table 3 prints peaks of 2.10 : 1.20 : 0.85 for dampings of 1 : 5 : 10. As slopes `d log(peak) / d log(B_sp)` these
-# are -0.35 and -0.50. The model's peak is `A / (mu omega)`, a slope of -1 or 10 : 2 : 1. Hardening weakens it, because
-# a higher peak lies at a higher frequency; but however strong, it leaves -1/2, and -0.35 is out of reach.
+# are -0.35 and -0.50. The model's peak is `A / (mu omega)`, a slope of -1 or 10 : 2 : 1. Hardening makes the slope
+# less steep, because a higher peak lies at a higher frequency. It remains steeper than -1/2, so that -0.35 is
+# impossible.
 
 # %%
 alone = dataclasses.replace(study, terms=(study.terms[0], dataclasses.replace(study.terms[1], weight=0.0)))
@@ -72,7 +73,7 @@ print(f"K = {K:.1f} N m/rad, B_sp = {B_sp:.4f} N m s/rad: peak {peak:.3f} mrad, 
 assert best.best.outcome.name == "optimum"
 
 # %% [markdown]
-# Brute force agrees: no design of a grid around it is better. And the gradients are those of differences.
+# No design of a grid around it is better, and the gradients equal difference quotients.
 
 # %%
 proof = confirm(study, best.best, width=0.25, points=7)
@@ -92,8 +93,8 @@ left.set_ylabel("K [N m/rad]")
 
 # %% [markdown]
 # ## The price of damping
-# The best designs of all prices are the front that Table 3's question asks for. A price is a number, so that no program
-# is compiled again.
+# The best designs at all prices are the Pareto front of peak and loss. A price is a number, so that no program is
+# compiled again.
 
 # %%
 front = []
@@ -111,5 +112,5 @@ right.set_ylabel("peak of the dynamic error [mrad]")
 right.legend(frameon=False)
 figure
 # %% [markdown]
-# Table 3 points the right way and is wrong in its figures: damping does up to twice as much as it says (on a
-# logarithmic scale), and in this model its price is milliwatts.
+# Table 3 is right in its direction and wrong in its figures. On a logarithmic scale, damping lowers the peak up to
+# twice as much as it says, and in this model it costs milliwatts.

@@ -8,9 +8,10 @@
 # %% [markdown]
 # # Which gear for a pointing drive?
 #
-# An antenna of 0.8 kg m^2 tracks at up to 1.2 rad/s in a wind of 20 N m. To choose: the size of the gear, which means
-# its stiffness (the vendor's table), the reduction ratio, and the inertia of the motor. A stiffer gear is heavier; a
-# higher ratio needs a smaller motor, but brings the two error cycles of each motor revolution nearer to the resonance.
+# An antenna of 0.8 kg m^2 tracks at up to 1.2 rad/s in a wind of 20 N m. The variables are the size of the gear, which
+# sets its stiffness (the vendor's table), the reduction ratio, and the inertia of the motor. A stiffer gear is heavier.
+# A higher ratio needs a smaller motor, but brings the two error cycles of each motor revolution nearer to the
+# resonance.
 
 # %%
 from typing import ClassVar
@@ -33,9 +34,9 @@ from hdjax.design.vendor import RATIOS, SIZES, gear
 WIND, ACCELERATION, TRACKING = 20.0, 4.0, 1.2  # N m, rad/s^2, rad/s
 
 # %% [markdown]
-# A measure is any differentiable function of a case. Two of our own: what gear and motor weigh (stiffness and rotor
-# inertia stand for it, at an assumed price), and how hard the motor works: of one family of motors each kilogram metre
-# squared of rotor gives so much torque.
+# A measure is any differentiable function of a case. Two are defined here. The weight of gear and motor is represented
+# by stiffness and rotor inertia, at an assumed ratio. The load of the motor is its torque over its rotor inertia, which
+# is limited within one family of motors.
 
 
 # %%
@@ -85,7 +86,7 @@ print("holds the design, and the weight that one unit of it is worth:", best.mul
 assert best.outcome.name == "optimum" and best.multipliers
 
 # %% [markdown]
-# Brute force agrees, and so do differences:
+# A grid around the optimum and difference quotients confirm it:
 
 # %%
 proof = confirm(study, best, width=0.15, points=7)

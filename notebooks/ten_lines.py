@@ -8,8 +8,8 @@
 # %% [markdown]
 # # Ten lines
 #
-# Logs in, results out: load the logs of a drive, fit the base model, look for what it lacks, and use the identified
-# model. The drive here is simulated and hides an effect that its drive file does not mention. Results show themselves.
+# Load the logs of a drive, fit the base model, look for what it lacks, and use the identified model. The drive is
+# simulated and hides an effect that its drive file does not mention. Each result has a view in a notebook.
 
 # %%
 import jax

@@ -10,8 +10,8 @@
 #
 # A fit compares a log with simulations of its segments. The plain way to simulate them is `diffrax.diffeqsolve`,
 # jit-compiled and vmapped over the segments, with adaptive steps. hdjax has two faster ways to evaluate the same
-# residual: a march by fixed steps that XLA compiles, and the same march as machine code of its own. All three feed the
-# same least-squares solver of optimistix. Here they fit the same log.
+# residual. One takes fixed steps by a program that XLA compiles; the other takes the same steps by machine code of its
+# own. All three use the same least-squares solver of optimistix. Here they fit the same log.
 
 # %%
 import time
