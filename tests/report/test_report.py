@@ -14,7 +14,7 @@ from report_cases import ESTIMATE_KEYS, HEALTH, HOLD, HOSTILE, T_C, VAGUE, with_
 
 import rig
 from fitting.attribution.selection_round import Verdict
-from fitting.outcome import Loop
+from fitting.outcome import FitOnly, Loop
 from fitting.report import Report, explained_share, report_dict, report_text
 from fitting.report.limits import limits, parameter_note
 from fitting.report.summary import summary
@@ -282,6 +282,10 @@ def test_summary_states_that_an_inexact_law_may_explain_the_residual(loop: Loop,
     report = report_dict(loop)
     report["times_noise"], report["evidence"]["challenge"]["imperfect"] = 1.9, imperfect
     assert said in summary(report)
+
+
+def test_reports_of_loop_and_fit_have_the_same_keys(loop: Loop, fitted: FitOnly):
+    assert set(report_dict(loop)) == set(report_dict(fitted))
 
 
 @pytest.mark.parametrize("kind", ["loop", "fitted"])
