@@ -67,6 +67,7 @@ def test_sections_of_the_report_page_are_in_order(page: str):
         "The data",
         "How it was done",
     ]
+    assert re.findall(r'<a href="#[a-z]+">(.*?)</a>', page) == heads
     assert "A missing effect was found: motor friction." in page
     assert not re.search(r"\bNaN\b|\bInfinity\b|\bnan\b|\bNone\b", page)
 
