@@ -42,9 +42,10 @@ def rules_page() -> str:
         [
             "# Rules of decision",
             "",
-            "Thresholds of all decisions of a loop (`fitting/attribution/rules.py`). A report has each",
-            "rule with its statistic and its outcome, under `rules` and in the section *Why this decision*. The page",
-            "is what `fitting.report.rules.rules_page()` gives.",
+            "Thresholds of all decisions of a loop (`fitting/attribution/rules.py`). A report has each rule with its",
+            "statistic and its outcome, under `rules` and in the section *Why this decision*. There is one more rule,",
+            "`imperfection`. Each form of an effect states the threshold: what its law may get wrong, as a share of",
+            "what it has removed.",
             "",
             "| rule | threshold | unit | meaning | source |",
             "|---|---|---|---|---|",

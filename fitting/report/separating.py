@@ -127,7 +127,7 @@ _SEPARATING = {
         "input_delay",
     ): "Drive the load by hand: a delay of an encoder remains, one of the torque does not.",
     ("input_delay", "input_delay"): "Excite up to several times the natural frequency, log the torque faster, and "
-    "state its hold in the drive file: a lag also weakens fast torques, a delay does not.",
+    "state its hold in the drive file. A lag also weakens fast torques, a delay does not.",
 }
 
 

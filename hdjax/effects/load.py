@@ -61,7 +61,7 @@ class ConstantLoad(LoadSideEffect):
 class LoadDisturbance(LoadSideEffect):
     """A torque `constant + cosine cos(omega t) + sine sin(omega t)` on the load, independent of the shafts.
 
-    The time counts from each log's start, and cosine and sine are common to all logs of a drive: for a disturbance that
+    The time counts from each log's start, and cosine and sine are common to all logs of a drive. For a disturbance that
     continues between logs, the clocks of all but one must be shifted until it is in phase.
     """
 

@@ -59,8 +59,8 @@ class PositionDependentStiffness(MeshTorqueEffect):
 class ConservativePositionDependentStiffness(PositionDependentStiffness):
     """The same ripple r(theta_m) of a conservative spring.
 
-    With the energy `K F(x) r(theta_m)`, where `F' = f`, there is a torque `-K F(x) r'(theta_m)` on the motor: about `n
-    N x / 2` times the ripple's mesh torque there.
+    With the energy `K F(x) r(theta_m)`, where `F' = f`, there is a torque `-K F(x) r'(theta_m)` on the motor. It is
+    about `n N x / 2` times the ripple's mesh torque there.
     """
 
     name: ClassVar[str] = "conservative_position_dependent_stiffness"
