@@ -105,8 +105,10 @@ def _remembering(report: Mapping[str, Any]) -> str:
     memory = report["noise"]["memory"]
     if memory is None:
         return ""
+    longest = max(log["seconds"] for log in report["logs"])
+    long = f"about {formatting.quantity(memory, 's', digits=2)}" if memory < longest else "more than the logs' length"
     return (
-        f" The residual has a correlation time of about {formatting.quantity(memory, 's', digits=2)}, and is "
+        f" The residual has a correlation time of {long}, and is "
         "attributed to noise of the sensors: with such noise the innovations are white. An untried effect that is as "
         "slow would look the same."
     )
@@ -141,7 +143,9 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
             f"{subject} affect{s} the motor's angle, whose error on {on} data falls by {_removed(*motor)}, from "
             f"{first} to {last}. The {output} is hardly affected, with an error of {then} before and {now} after."
         )
-    if before is not None and (after is None or after > before):
+    if after is None and before is None:
+        return f"{subject} explain{s} short segments alone: free runs along {on} data diverge before and after."
+    if after is None or (before is not None and after > before):
         where = f"short segments alone; over whole stretches of {on} data the error rises"
         return f"{subject} explain{s} {where} from {then} to {now}."
     return f"{subject} remove{s} {_removed(before, after)} of the error on {on} data, which falls from {then} to {now}."

@@ -112,14 +112,26 @@ def test_summary_states_the_motor_angle_error_where_the_dynamic_error_is_unchang
     assert said in _change("It", _report_with_errors(8.7e-7, after, motor=motor))
 
 
-@pytest.mark.parametrize(("memory", "said"), [(0.028, "correlation time of about 28 ms"), (None, "")])
+def test_summary_claims_no_change_where_free_runs_diverge_before_and_after():
+    said = _change("It", _report_with_errors(None, None, motor=(None, None)))
+    assert said == "It explains short segments alone: free runs along test data diverge before and after."
+
+
+@pytest.mark.parametrize(
+    ("memory", "said"),
+    [
+        (0.028, "correlation time of about 28 ms"),
+        (1400.0, "correlation time of more than the logs' length"),
+        (None, ""),
+    ],
+)
 def test_summary_states_the_correlation_time_of_the_noise(memory: float | None, said: str):
-    sentence = _remembering({"noise": {"memory": memory}})
+    sentence = _remembering({"noise": {"memory": memory}, "logs": [{"seconds": 8.0}, {"seconds": 6.0}]})
     assert said in sentence and bool(sentence) == (memory is not None)
 
 
 def _report_with_errors(
-    before: float, after: float | None, *, motor: tuple[float | None, float | None]
+    before: float | None, after: float | None, *, motor: tuple[float | None, float | None]
 ) -> dict[str, Any]:
     stages = zip(("before", "after"), (before, after), motor, strict=True)
     found = {s: {"rmse": {"test": x}, "rmse_motor_angle": {"test": m}} for s, x, m in stages}
