@@ -6,8 +6,17 @@ from typing import Any
 from fitting.attribution.decisions import Check
 from fitting.attribution.rules import rules_table
 
-# The only threshold per form, in the code of the effect.
-_OF_LAWS = {"unit": "share of rms", "meaning": "possible error of earlier effects' laws, relative to what they removed"}
+# A threshold per form, in the code of the effect; and a test whose statistic and threshold are not the rule's p-value.
+_APPLIED = {
+    "imperfection": {
+        "unit": "share of rms",
+        "meaning": "possible error of earlier effects' laws, relative to what they removed",
+    },
+    "tie_level": {
+        "unit": "standard errors",
+        "meaning": "largest mean difference to the best one, over blocks, at which a candidate is tied with it",
+    },
+}
 
 
 def rules_dict(checks: Sequence[Check]) -> list[dict[str, Any]]:
@@ -16,7 +25,7 @@ def rules_dict(checks: Sequence[Check]) -> list[dict[str, Any]]:
     Args:
         checks: of a decision.
     """
-    known = {rule["name"]: rule for rule in rules_table()} | {"imperfection": _OF_LAWS}
+    known = {rule["name"]: rule for rule in rules_table()} | _APPLIED
     return [_entry(check, known.get(check.rule, {})) for check in checks]
 
 
