@@ -13,6 +13,7 @@ from fitting.report.outputs import in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.plots import Plot
 from fitting.report.posterior import QUANTILES
+from fitting.report.proposal import next_lines
 from fitting.report.separating import plain_family
 from fitting.report.summary import chance
 from fitting.report.tables import changes, parameter_rows
@@ -63,9 +64,8 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
             rows=parameter_rows(report, final),
             changes=changes(report),
             quantiles=QUANTILES,
-            sections={
-                s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found", "next")
-            },
+            next_lines=next_lines(report),
+            sections={s: [p for p in pictures if p.section == s] for s in _SECTIONS},
             plotlyjs=Markup(get_plotlyjs()),
         )
     )

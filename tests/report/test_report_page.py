@@ -10,10 +10,11 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 from browser import shown
-from report_cases import FILES, HOSTILE, write_page
+from report_cases import FILES, HOSTILE, VAGUE, with_estimate, with_limits, write_page
 
 from fitting.outcome import FitOnly, Loop
-from fitting.report import Report
+from fitting.report import Report, report_dict
+from fitting.report.page import report_page
 from fitting.report.plots import decimated, fit_plots, plots
 from fitting.report.web_page import environment
 from fitting.stored_model import to_json
@@ -53,6 +54,24 @@ def test_markup_in_names_is_escaped_in_the_page_of_a_fit(fitted: FitOnly, tmp_pa
     page = write_page(tmp_path, fitted)
     assert HOSTILE not in page and "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert page.count("<script>") == 1 and page.count("</script>") == 2
+
+
+@pytest.mark.parametrize(
+    ("sought", "said"), [(False, "--next-experiment searches for a command"), (True, "No next experiment: either")]
+)
+def test_page_tells_whether_a_next_experiment_was_sought(fitted: FitOnly, sought: bool, said: str):
+    vague = with_estimate(fitted, "account", "alpha", ci95=(-1910.0, 2010.0), identifiable=False)
+    vague = with_limits(vague, "account", reasons={"alpha": VAGUE})
+    page = report_page(report_dict(vague, sought=sought), [])
+    assert said in page and page.count("next-experiment") <= 1
+
+
+def test_page_of_a_loop_without_effects_compares_no_explanations(loop: Loop):
+    report = report_dict(loop)
+    assert "No other explanation that was tried does as well." in report_page(report, [])
+    report["after"]["effects"], report["forms_tried"] = [], 0
+    page = report_page(report | {"decision": "model_sufficient"}, [])
+    assert "No other explanation" not in page and "Nothing: no form of missing physics was tried." in page
 
 
 def test_sections_of_the_report_page_are_in_order(page: str):
