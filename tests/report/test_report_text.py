@@ -3,12 +3,16 @@
 import math
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 
 from fitting import formatting
+from fitting.attribution.decisions import tie
 from fitting.report import separating_experiment
 from fitting.report.intervals import is_withheld, say_what_intervals_hold
+from fitting.report.rules import rules_dict
 from fitting.report.summary import _change, _remembering
+from fitting.report.tables import parameter_rows
 from hdjax.effects import FAMILIES
 
 
@@ -190,3 +194,17 @@ def test_intervals_beside_a_learned_torque_in_the_mesh_are_withheld(place: str, 
 def _account() -> dict[str, Any]:
     parameter = {"ci95": [1.0, 2.0], "interval": "quadratic", "flag": None, "note": None}
     return {"parameters": {"K": dict(parameter)}, "derived": {"omega_0": dict(parameter)}}
+
+
+def test_tie_is_told_with_the_unit_of_its_statistic():
+    (rule,) = rules_dict([tie("rival", np.array([1.0, 1.1, 0.9]))])
+    assert rule["unit"] == "standard errors" and "p-value" not in rule["meaning"]
+    assert rule["threshold"] > 1.0
+
+
+@pytest.mark.parametrize(("path", "symbol"), [("K", "K(1 + 3 α x²)"), ("omega_0", "ω₀²(1 + 3 α x²)")])
+def test_reduced_log_has_no_stiffness(path: str, symbol: str):
+    entry = {"value": 1.0, "std": 0.1, "unit": "1", "flag": None, "description": ""}
+    account = {"parameters": {path: entry}, "derived": {"stiffness_at_full_twist": entry}}
+    _, row = parameter_rows({"before": account}, account)
+    assert row["symbol"] == symbol
