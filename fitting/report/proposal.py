@@ -126,9 +126,12 @@ def _tie_says(found: str, separation: Separation) -> str:
         for name, old, new in cases
     )
     sentence = f"Between {found} and {rival}: {sentence}."
-    for name, other, new in ((found, rival, proposed[0]), (rival, found, proposed[1])):
-        if new < _NOTHING:
-            sentence += f" With its parameters free, {other} can imitate {name}, but not the reverse."
+    if max(proposed) < _NOTHING:
+        sentence += " With its parameters free, each can imitate the other."
+    else:
+        for name, other, new in ((found, rival, proposed[0]), (rival, found, proposed[1])):
+            if new < _NOTHING:
+                sentence += f" With its parameters free, {other} can imitate {name}, but not the reverse."
     if max(proposed) < _DECISIVE:
         more = _DECISIVE / max(max(proposed), 1e-300)
         needs = f"about {formatting.number(more, 2)} times the duration" if more < 1e4 else "wider limits"

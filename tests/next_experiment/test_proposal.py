@@ -264,6 +264,7 @@ UNITS = {"dynamic_error": "rad", "forcing": "N m"}
     [
         ({"on_logs": (0.2, 0.3), "proposed": (50.0, 60.0)}, ["50 (the logs: 0.20)", "60 (the logs: 0.30)"]),
         ({"on_logs": (0.0, 0.3), "proposed": (0.0, 60.0)}, ["rival can imitate found"]),
+        ({"on_logs": (0.0, 0.0), "proposed": (0.01, 0.02)}, ["free, each can imitate the other. That is not decisive"]),
         ({"on_logs": None, "proposed": (1.0, 2.0)}, ["the logs: unknown", "5.0 times the duration"]),
         ({"on_logs": (1e7, 2e4), "proposed": None}, ["already separate", "above 1e+06", "no new experiment"]),
         ({"on_logs": None, "proposed": None}, ["not smooth enough"]),
