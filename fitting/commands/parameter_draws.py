@@ -20,9 +20,9 @@ from hdjax.design import Draws
 def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), seed: int = 0) -> Draws:
     """Draws of a fitted drive's parameters.
 
-    Those of `hdjax fit --posterior` where available, evenly thinned. Else from the normal distribution with the
-    report's standard errors and correlations, in the logarithm of positive parameters. Correlations below 0.1, which a
-    report omits, count as zero.
+    Those of `hdjax fit --posterior` where the report has them, evenly thinned. Else from the normal distribution with
+    the report's standard errors and correlations, in the logarithm of positive parameters. Correlations below 0.1,
+    which a report omits, count as zero.
 
     Args:
         folder: of a report of `hdjax fit` or `hdjax close-loop`.
@@ -53,7 +53,8 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
                 f'add hold = ["{path}"] to [robust]'
             )
     paths = tuple(spreads)
-    if (folder / DRAWS_FILE).exists():
+    # An earlier fit may have left its draws in the folder.
+    if report.get("posterior") and (folder / DRAWS_FILE).exists():
         try:
             table = pl.read_parquet(folder / DRAWS_FILE).select(paths)
         except (OSError, pl.exceptions.PolarsError) as error:

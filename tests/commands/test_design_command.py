@@ -128,7 +128,7 @@ def test_invalid_design_file_is_refused_in_one_sentence(name: str, tmp_path: Pat
 # -- the folder of a fit --
 
 
-def write_fit_report(folder: Path, **changes: object) -> Path:
+def write_fit_report(folder: Path, *, posterior: bool = False, **changes: object) -> Path:
     """Write those parts of a report of `hdjax fit` that draws need."""
     model = TwoInertiaModel(hdc_40_050())
     stored = StoredModel(model, "zero-order", 1, 0, jnp.eye(2))
@@ -139,7 +139,8 @@ def write_fit_report(folder: Path, **changes: object) -> Path:
         "alpha": {"value": 1e5, "std": 2e4, "identifiable": True} | changes,
     }
     account = {"parameters": parameters, "correlations": [{"between": ["K", "alpha"], "value": -0.9}]}
-    (folder / "report.json").write_text(json.dumps({"before": account, "after": {"parameters": {}}}))
+    report = {"before": account, "after": {"parameters": {}}, "posterior": {"draws": 9} if posterior else None}
+    (folder / "report.json").write_text(json.dumps(report))
     return folder
 
 
@@ -156,16 +157,19 @@ def test_parameter_draws_have_the_reported_standard_errors_and_correlations(tmp_
 
 
 def test_posterior_draws_take_precedence_over_the_normal_distribution(tmp_path: Path):
-    folder = write_fit_report(tmp_path)
+    folder = write_fit_report(tmp_path, posterior=True)
     table = pl.DataFrame(
         {"chain": [0] * 9, "draw": range(9), "K": np.arange(9.0), "B_sp": [1.0] * 9, "alpha": [2.0] * 9}
     )
     table.write_parquet(folder / "posterior.parquet")
     np.testing.assert_allclose(np.asarray(drawn_from_report(folder, 3).values)[:, 0], [0.0, 4.0, 8.0])
+    # A later fit into the same folder, without draws.
+    write_fit_report(folder)
+    assert np.asarray(drawn_from_report(folder, 3).values)[:, 0].min() > 6000.0
 
 
 def test_posterior_draws_of_other_parameters_are_refused(tmp_path: Path):
-    folder = write_fit_report(tmp_path)
+    folder = write_fit_report(tmp_path, posterior=True)
     pl.DataFrame({"mu": [1.0]}).write_parquet(folder / "posterior.parquet")
     with pytest.raises(InputError, match="not the draws of K, B_sp, alpha"):
         drawn_from_report(folder, 3)
