@@ -9,6 +9,7 @@ from fitting.commands.options import (
     Logs,
     Search,
     TestLogs,
+    require_folder,
     wanted,
 )
 from fitting.commands.start import start_jax
@@ -49,6 +50,7 @@ def fit(
         If alpha is not identifiable, search for a motor torque within limits that determines it (up to a minute),
         and write it to next_experiment.csv.
     """
+    require_folder(out)
     asked = wanted(limits, next_experiment)
     folder = next((path for path in logs if path.is_dir()), None)
     if (fleet.workers or fleet.scheduler) and folder is None:
@@ -97,6 +99,7 @@ def close_loop(
         If explanations are tied, search for a motor torque within limits that separates them (minutes), and write
         it to next_experiment.csv.
     """
+    require_folder(out)
     if search.max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {search.max_effects}")
     asked = wanted(limits, next_experiment)
@@ -116,6 +119,7 @@ def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
     seed
         Of torque and noise.
     """
+    require_folder(out)
     start_jax()
     from fitting.commands.run_fit import demonstrate
 

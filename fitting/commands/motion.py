@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from fitting.commands.options import DriveFileOption, ForcingOptions
+from fitting.commands.options import DriveFileOption, ForcingOptions, require_number
 from fitting.commands.start import start_jax
-from fitting.errors import InputError
 
 
 def predict(model: Path, log: Path, /, *, drive: DriveFileOption, out: Path) -> None:
@@ -52,9 +51,10 @@ def simulate(
     seed
         Of phases and noise.
     """
-    for name, value in {"duration": torque.duration, "rate": torque.rate, "frequency": torque.frequency}.items():
-        if not value > 0:
-            raise InputError(f"--{name} must be positive, but is {value}")
+    for name in ("duration", "rate", "frequency", "frequency_end"):
+        require_number(f"--{name.replace('_', '-')}", getattr(torque, name))
+    require_number("--amplitude", torque.amplitude, positive=False)
+    require_number("--noise", noise, positive=False)
     start_jax()
     from fitting.commands.run_simulate import write_simulation
 

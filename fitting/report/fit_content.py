@@ -98,6 +98,8 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
         )
     if not report["goodness"]["converged"]:
         notes.append("The iteration stopped before it met its tolerance: the values are provisional.")
+    left = report["goodness"]["error_over_noise"]
+    worst = max(left, key=lambda output: left[output])
     missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
     if over_noise is None:
         notes.append(f"The free run diverges on {on} data: the model does not describe this drive.")
@@ -109,6 +111,12 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
         )
         if over_noise < _DRIFTED:
             notes.append("The estimate of the measurement noise contains a part of what is missing: don't rely on it.")
+    elif left[worst] >= _DRIFTED:
+        if source == "torque":
+            notes.append(
+                f"The {worst} is not explained: its residual over short simulations is "
+                f"{formatting.number(left[worst])} times its noise. `hdjax close-loop` searches for what acts on it."
+            )
     elif over_noise < _NOTHING_BUT_NOISE:
         notes.append("The model explains these logs down to the measurement noise.")
     if rmse["training"] is not None and rmse["test"] is not None and rmse["test"] > _DRIFTED * rmse["training"]:

@@ -158,6 +158,10 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     ),
     "unknown preset": (("simulate", "--out", "out", "--preset", "HFUC"), ("HFUC", "HDC-40-050")),
     "no rate": (("simulate", "--out", "out", "--rate", "0"), ("--rate",)),
+    "simulation without end": (("simulate", "--out", "out", "--duration", "inf"), ("--duration", "inf")),
+    "noise that is no number": (("simulate", "--out", "out", "--noise", "nan"), ("--noise", "nan")),
+    "report into a file": ((*FIT[:-1], "log.csv"), ("--out", "log.csv")),
+    "report of a loop below a file": (("close-loop", *FIT[1:-1], "log.csv/below"), ("--out", "log.csv")),
     "no line in the band": (
         ("simulate", "--out", "out", "--frequency", "10", "--frequency-end", "10.01", "--duration", "0.55"),
         ("--frequency",),

@@ -22,6 +22,7 @@ from fitting.estimation.starting_values import starting_models
 from fitting.fit_drive import fit_only
 from fitting.outcome import FitOnly
 from fitting.report import report_dict, report_text
+from fitting.report.fit_content import meaning
 from fitting.report.plots import fit_plots
 from fitting.uncertainty.posterior import Posterior
 from fitting.uncertainty.standard_errors import Uncertainty
@@ -91,6 +92,14 @@ def test_report_of_a_sufficient_model_passes_all_residual_tests(monkeypatch: pyt
     assert good["meaning"] == ["The model explains these logs down to the measurement noise."]
     assert good["goodness"]["reduced_chi_square"] == pytest.approx(1.0, abs=0.1)
     assert good["before"]["rmse"]["test"] < 1.2 * good["noise"]["dynamic_error"]
+
+
+def test_unexplained_motion_of_the_motor_is_told_beside_an_explained_twist(fitted: FitOnly):
+    found = report_dict(fitted)
+    tests = [test | {"verdict": "passed"} for test in found["residual_tests"]]
+    found["goodness"]["rmse_over_noise"]["test"] = 1.0
+    notes = " ".join(meaning(found | {"residual_tests": tests}))
+    assert "The motor angle is not explained" in notes and "down to the measurement noise" not in notes
 
 
 def test_diverged_fit_has_a_report(fitted: FitOnly, tmp_path: Path):
