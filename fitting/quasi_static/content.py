@@ -212,7 +212,7 @@ def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFi
     left, elastic = np.mean(best.misfit**2), np.var(best.curve.elastic(best.parameters, fit.blocks.torque)[0])
     softer = float(left / (elastic + left))
     bias = (
-        " on a straight line" if fit.chosen == "linear" else ", since the torque has one sign only: it is taken as zero"
+        " on a straight line" if fit.chosen == "linear" else ", since torques have mostly one sign: it is taken as zero"
     )
     notes = [
         *((True, f"{not_identifiable(names)}: {reason}.") for reason, names in reasons.items()),

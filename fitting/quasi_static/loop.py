@@ -53,7 +53,7 @@ class QuasiStaticLoop:
         at_rest: The analysis of rests, or None where no joint rested.
         dropped: Accepted forms that a later one made superfluous.
         left: A dependence of the final residual, if any.
-        forms_tried: Number of forms in the catalogue.
+        forms_tried: Number of forms in the catalogue; zero without a search.
         checks: Every applied rule.
     """
 
@@ -137,7 +137,7 @@ def close_loop(
         at_rest=at_rest,
         dropped=dropped,
         left=left,
-        forms_tried=len(forms),
+        forms_tried=len(forms) if rounds else 0,
         checks=(*(check for check in asked if math.isfinite(check.statistic)), *final_checks),
     )
 

@@ -241,7 +241,10 @@ def _nothing_found(report: Mapping[str, Any], before: float) -> str:
         f"on {on} it errs by {formatting.quantity(before, 'rad')} rms "
         f"({formatting.number(before / noise)} times the twist's noise)"
     )
-    tried = f"none of the {report['forms_tried']} tried forms of missing physics has a significant gain"
+    count = report["forms_tried"]
+    tried = "no form of missing physics was tried"
+    if count:
+        tried = f"none of the {count} tried forms of missing physics has a significant gain"
     if report["dropped"]:
         tried += " and a size that the logs determine"
     if before < _NOISE * noise:
