@@ -72,7 +72,7 @@ def noise_model(
     predictable: float,
     residual: Float[Array | np.ndarray, "outputs outputs"] | None = None,
 ) -> NoiseModel | None:
-    """Estimate the noise model of a fit's residual; None where the model diverges.
+    """Estimate the noise model of a fit's residual; None where the model diverges, or the sensors have no noise.
 
     Each log has its own torque noise, since its torque sensor may have another range. The sensors' white noise is at
     most the estimate from short pieces, which includes torque noise. Correlated sensor noise is added only where
@@ -92,7 +92,16 @@ def noise_model(
         steps = _steps(fit, np.asarray(fit.covariance if residual is None else residual))
     if not np.all(np.abs(steps.transition) < RUNAWAY):
         return None
-    known = white_noise(np.asarray(outputs))
+    try:
+        with np.errstate(invalid="ignore"):
+            return _likeliest_model(steps, white_noise(np.asarray(outputs)), predictable)
+    except np.linalg.LinAlgError:
+        # Sensors without noise: by rounding, a variance is not positive.
+        return None
+
+
+def _likeliest_model(steps: Steps, known: SensorNoise, predictable: float) -> NoiseModel:
+    """The noise model of linearised segments; arguments as in [`noise_model`][]."""
     count = len(known.white)
 
     def white(unknowns: np.ndarray) -> SensorNoise:

@@ -111,6 +111,15 @@ def test_torque_noise_is_estimated_despite_overrated_sensor_noise(noisy: Fit):
     assert found.std == pytest.approx(STD, rel=0.1) and np.isfinite(found.likelihood)
 
 
+def test_sensors_without_noise_have_no_noise_model():
+    """By rounding, the filter's variances are not positive."""
+    torque = rig.drive_torque(1000)
+    log = rig.drive_log(rig.drive_motion(torque), torque, noise=0.0)
+    found = fitted(experiment_from_log(log, hold="zero-order", N=rig.N))
+    least = 1e-8 * np.asarray(measurement_noise(found).covariance)
+    assert noise_model(found, least, predictable=RULES.innovations) is None
+
+
 @pytest.mark.parametrize("correlation, std", [(0.8, 0.0), (0.98, 0.0), (0.8, STD), (0.98, STD)])
 def test_sensor_noise_is_estimated_with_its_memory_and_size(correlation: float, std: float):
     found = noise_model_of(fitted(noisy_experiment(correlation=correlation, std=std, count=8000)))
