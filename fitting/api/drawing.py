@@ -52,9 +52,14 @@ def _trace(place: Any, trace: dict[str, Any]) -> None:
     label = trace.get("name") if trace.get("showlegend", True) else None
     if kind == "heatmap":
         values = np.array(trace["z"], dtype=float)
-        shown = place.imshow(values, cmap="RdBu", vmin=trace.get("zmin"), vmax=trace.get("zmax"), aspect="auto")
-        place.set_xticks(range(values.shape[1]), trace["x"], rotation=45, ha="right")
-        place.set_yticks(range(values.shape[0]), trace["y"])
+        most = trace.get("zmax", np.nanmax(np.abs(values)))
+        look = {"cmap": "RdBu", "vmin": -most, "vmax": most}
+        if isinstance(trace["x"][0], str):
+            shown = place.imshow(values, aspect="auto", **look)
+            place.set_xticks(range(values.shape[1]), trace["x"], rotation=45, ha="right")
+            place.set_yticks(range(values.shape[0]), trace["y"])
+        else:
+            shown = place.pcolormesh(trace["x"], trace["y"], values, shading="nearest", **look)
         place.figure.colorbar(shown, ax=place)
         return
     color = trace.get("line", {}).get("color") or trace.get("marker", {}).get("color")
@@ -72,6 +77,9 @@ def _trace(place: Any, trace: dict[str, Any]) -> None:
         marker=_MARKERS.get(trace.get("marker", {}).get("symbol", "circle"), "o") if "markers" in mode else None,
         markersize=3.0,
     )
+    if "error_y" in trace:
+        reach = [np.nan if v is None else v for v in trace["error_y"]["array"]]
+        place.errorbar(x, y, reach, fmt="none", ecolor=_of_matplotlib(color), elinewidth=1.0)
 
 
 def _bars(place: Any, trace: dict[str, Any], number: int, count: int) -> None:

@@ -1,5 +1,6 @@
 """Inspection of logs without a drive file."""
 
+import html
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
@@ -124,7 +125,7 @@ class InspectionResult:
         return self.summary()
 
     def _repr_html_(self) -> str:
-        told = " ".join(self.told).replace("&", "&amp;").replace("<", "&lt;")
+        told = html.escape(" ".join(self.told), quote=False)
         return f"<p>{told}</p>{self.columns._repr_html_()}"
 
 

@@ -1,5 +1,6 @@
 """Free runs of identified models along logs, and comparison of models."""
 
+import html
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -69,7 +70,7 @@ class Prediction:
         return f"{self.run.name}: rms error {self.run.rmse:.4g}, fit {fit_percent([self.run]):.4g} %"
 
     def _repr_html_(self) -> str:
-        return f"<p>{self.summary()}</p>{self.table._repr_html_()}"
+        return f"<p>{html.escape(self.summary(), quote=False)}</p>{self.table._repr_html_()}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """Results of fits and loops: tables, a summary, plots, a report on disk."""
 
+import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -151,8 +152,8 @@ class Result:
         return f"{type(self).__name__}({self.report['name']}: {self.report['summary']})"
 
     def _repr_html_(self) -> str:
-        sentence = self.report["summary"].replace("&", "&amp;").replace("<", "&lt;")
-        return f"<p><b>{self.report['name']}</b>: {sentence}</p>{self.parameters._repr_html_()}"
+        name, sentence = (html.escape(self.report[key], quote=False) for key in ("name", "summary"))
+        return f"<p><b>{name}</b>: {sentence}</p>{self.parameters._repr_html_()}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

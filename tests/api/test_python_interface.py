@@ -1,5 +1,6 @@
 """The Python interface: `load`, `fit`, `close_loop`, `predict`, `compare`, and their results."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -15,6 +16,8 @@ import torque_cycles
 import fitting
 import rig
 from fitting import DataError, InputError
+from fitting.api.drawing import draw
+from fitting.report.plots import Plot
 
 matplotlib.use("Agg")
 
@@ -120,6 +123,19 @@ def test_fit_result_gives_table_text_plots_and_report(fit_result: fitting.FitRes
     folder = fit_result.save(tmp_path / "report")
     stored = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert stored["before"]["parameters"] == fit_result.to_dict()["before"]["parameters"]
+
+
+def test_names_are_escaped_in_notebooks(fit_result: fitting.FitResult):
+    named = dataclasses.replace(fit_result.told, content=fit_result.report | {"name": "a <b> & c"})
+    assert "<b>a &lt;b&gt; &amp; c</b>: " in dataclasses.replace(fit_result, told=named)._repr_html_()
+
+
+def test_surface_is_drawn_over_its_axes():
+    heat = {"type": "heatmap", "x": [0.0, 0.5, 1.0], "y": [2.0, 4.0], "z": [[1.0, None, -3.0], [0.0, 1.0, 2.0]]}
+    axes = draw(Plot("surface", "found", "", "", {"data": [heat], "layout": {}}))
+    # Cells extend to half of a step on either side.
+    assert axes.get_xlim() == pytest.approx((-0.25, 1.25)) and axes.get_ylim() == pytest.approx((1.0, 5.0))
+    assert axes.collections[0].get_clim() == (-3.0, 3.0)
 
 
 def test_loop_result_names_the_missing_effect(loop_result: fitting.LoopResult):
