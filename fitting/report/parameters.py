@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from fitting import formatting
 from fitting.outcome import Finding
 from fitting.report.limits import NOT_TOLD_FROM_ZERO, in_words_of_log, parameter_note
 from fitting.report.outcome import Outcome
+from fitting.uncertainty.identifiability import unit_in_log
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
 from fitting.validation.account import Account
 from fitting.validation.derived_quantities import Derived, derived, drive_figures, effect_figures
 from hdjax import Drive, Model, ReducedModel
-from hdjax.effects import ActuatorEffect
 
 _TOLD_CORRELATION = 0.1
 
@@ -117,14 +116,7 @@ def _correlations(uncertainty: Uncertainty) -> list[dict[str, Any]]:
 
 
 def _unit_in_log(unit: str, path: str, model: Model, units: Mapping[str, str]) -> str:
-    """The unit of the parameter at a path; for a reduced drive from the log."""
-    if not isinstance(model, ReducedModel):
-        return unit
-    place: formatting.Place = "drive"
-    if "." in path:
-        effect = model.effect(path.split(".")[0])
-        place = "actuator" if isinstance(effect, ActuatorEffect) else "mesh"
-    return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"], place=place)
+    return unit_in_log(path, unit, model, response=units["dynamic_error"], forcing=units["forcing"])
 
 
 def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any]:

@@ -13,10 +13,11 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import Problem
 from fitting.estimation.scales import scales
-from fitting.formatting import words
+from fitting.formatting import Place, in_log_units, words
 from fitting.uncertainty.sandwich import directions
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
-from hdjax import Drive, Model, TwoInertiaModel
+from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
+from hdjax.effects import ActuatorEffect
 from hdjax.parameters import ParameterInfo
 
 # A direction is not determined if two standard errors along it exceed 40 %.
@@ -105,16 +106,34 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     x_max = scales(fit.stretches, fit.model).x_max
     x_unit = "rad" if isinstance(fit.model.drive, Drive) else "[x]"
     known, first = fit.model.parameters(), fit.problem.model
-    bounds = {
-        p: at_bound(p, float(known[p][0]), _in_units_of(fit.model, known[p][1]), start=float(first.get(p)))
-        for p in estimates
-    }
+    units = {p: unit_in_log(p, e.unit, fit.model) for p, e in estimates.items()}
+    infos = {p: replace(_in_units_of(fit.model, known[p][1]), unit=units[p]) for p in estimates}
+    bounds = {p: at_bound(p, float(known[p][0]), infos[p], start=float(first.get(p))) for p in estimates}
+    vague = {p: replace(e, unit=units[p]) for p, e in estimates.items() if not e.identifiable}
     return Identifiability(
-        reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in estimates.items() if not e.identifiable},
+        reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in vague.items()},
         directions=_directions(fit, found),
         held=_held(fit, found),
         bounds={p: sentence for p, sentence in bounds.items() if sentence is not None},
     )
+
+
+def unit_in_log(path: str, unit: str, model: Model, *, response: str = "[x]", forcing: str = "[u]") -> str:
+    """The unit of a parameter, or of a figure of its effect; of a reduced drive in units of its log.
+
+    Args:
+        path: of the parameter.
+        unit: in SI.
+        model: with the parameter.
+        response: unit of the dynamic error.
+        forcing: of the forcing.
+    """
+    if not isinstance(model, ReducedModel):
+        return unit
+    place: Place = "drive"
+    if "." in path:
+        place = "actuator" if isinstance(model.effect(path.split(".")[0]), ActuatorEffect) else "mesh"
+    return in_log_units(unit, response=response, forcing=forcing, place=place)
 
 
 def needed_twist(alpha: Estimate, size: float, *, x_max: float) -> float:

@@ -156,6 +156,11 @@ def test_bounds_in_si_units_are_ignored_for_a_reduced_log():
         float(found.model.get("bouc_wen.memory_twist")) > found.model.parameters()["bouc_wen.memory_twist"][1].bounds[1]
     )
     assert "bouc_wen.memory_twist" not in identifiability(found, uncertainty(found)).bounds
+    # What is told of an effect has the log's units too.
+    gone = eqx.tree_at(lambda f: f.model, found, found.model.replace({"bouc_wen.memory_twist": 1e-6}))
+    assert (
+        "to 1e-06 [x], its bound at zero" in identifiability(gone, uncertainty(found)).bounds["bouc_wen.memory_twist"]
+    )
 
 
 @pytest.mark.parametrize(
