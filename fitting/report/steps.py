@@ -1,6 +1,6 @@
 """Error on selection data after each step of the loop, over short segments where errors hardly accumulate."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fitting import formatting
@@ -24,12 +24,14 @@ def steps(outcome: Outcome) -> list[dict[str, Any]]:
         if this.accepted and this.winner.trial is not None:
             found.append(_step(this.winner.name, this.winner.trial, seconds))
     if outcome.unknown is not None:
-        found.append(_step(outcome.unknown.chosen.form.name, outcome.unknown.trial, seconds))
+        found.append(_step(outcome.unknown.chosen.form.name, outcome.unknown.trial, seconds, outcome.doubted))
     return found
 
 
-def _step(added: str | None, trial: Trial, seconds: float) -> dict[str, Any]:
-    return {"added": added, "selection_segments_rmse": trial.held_out.principal_std, "segment_seconds": seconds}
+def _step(added: str | None, trial: Trial, seconds: float, in_place_of: Sequence[str] = ()) -> dict[str, Any]:
+    error = trial.held_out.principal_std
+    known = {"added": added, "in_place_of": list(in_place_of)}
+    return known | {"selection_segments_rmse": error, "segment_seconds": seconds}
 
 
 def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | None:

@@ -74,6 +74,13 @@ def test_page_of_a_loop_without_effects_compares_no_explanations(loop: Loop):
     assert "No other explanation" not in page and "Nothing: no form of missing physics was tried." in page
 
 
+def test_step_of_a_learned_term_tells_the_names_that_it_replaces(loop: Loop):
+    report = report_dict(loop)
+    assert [step["in_place_of"] for step in report["steps"]] == [[], []]
+    report["steps"].append(report["steps"][-1] | {"added": "learned", "in_place_of": ["motor_friction"]})
+    assert "<code>learned</code>, in place of motor_friction" in report_page(report, [])
+
+
 def test_sections_of_the_report_page_are_in_order(page: str):
     heads = re.findall(r"<h2>(.*?)</h2>", page)
     assert heads == [
