@@ -1,11 +1,10 @@
 """Plot of a design study: the sweep around the optimum, and the draws at it."""
 
-from io import BytesIO
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fitting.commands.pictures import png
 from fitting.formatting import pretty_unit
 from hdjax.design import Confirmation, Optimised, Study
 from hdjax.design.robustness import exact_worst_share
@@ -34,9 +33,7 @@ def summary(study: Study, found: Optimised, proof: Confirmation) -> bytes:
         else "Design study: no design meets all limits",
         fontsize=11,
     )
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    return buffer.getvalue()
+    return png(figure)
 
 
 def _values(study: Study, shares: np.ndarray, i: int) -> np.ndarray:

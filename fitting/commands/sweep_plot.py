@@ -1,11 +1,12 @@
 """Summary plot of a sweep: a heat map, a response curve, or the worst cases of a sample."""
 
-from io import BytesIO
 from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+
+from fitting.commands.pictures import png
 
 _WORST = 15
 _FIRST = ("peak", "amplitude", "settling_time", "x_end", "x")
@@ -45,9 +46,7 @@ def summary(result: Any) -> bytes:
         plot.set(xlabel=_label(result, across), ylabel=_label(result, vertical))
         plot.set(xscale=_scale(drawn[across]), yscale=_scale(drawn[vertical]))
     figure.suptitle(result.attrs["route"], fontsize=9)
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    return buffer.getvalue()
+    return png(figure)
 
 
 def _worst_cases(plot: Any, result: Any, values: np.ndarray, label: str) -> None:
