@@ -228,8 +228,11 @@ def _summary(report: Mapping[str, Any]) -> str:
     if left["depends_on"] is not None:
         share = formatting.percent(left["explained_share"])
         depends = f"depends on the {left['depends_on']}, which explains {share} of it on held-out stretches"
+    cause = (
+        " that the catalogue does not explain" if report["forms_tried"] else ": no form of missing physics was tried"
+    )
     return (
-        f"Something is missing that the catalogue does not explain.{part} The residual, "
+        f"Something is missing{cause}.{part} The residual, "
         f"{formatting.number(left['times_noise'])} times the twist's noise, {depends}."
     )
 
