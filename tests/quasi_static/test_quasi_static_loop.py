@@ -14,6 +14,7 @@ from fitting.quasi_static.attribution import Held
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import QuasiStaticLoop, catalogue, close_loop
+from fitting.quasi_static.loop_content import _summary
 from fitting.quasi_static.noise_colour import DRAWS, autoregression, noise_of_the_same_colour
 from fitting.quasi_static.points import Points, points_of, without_noise
 from fitting.quasi_static.preparation import prepare
@@ -81,6 +82,15 @@ def test_missing_effect_is_identified(family: str, effect: slow_joints.Effect, o
     assert loop.after.rmse < 0.8 * loop.before.rmse
     # At most 1 % of the draws of noise have as large a gain.
     assert loop.findings[0].p_value <= 0.01
+
+
+def test_no_form_is_said_to_be_tried_without_a_search() -> None:
+    loop = closed(slow_joint([slow_joints.hardening(1e5)], cycles=1.6), max_effects=0)
+    assert loop.rounds == () and loop.forms_tried == 0
+    report = {"after": {"effects": []}, "before": {"rmse": {"test": 1e-5}}, "judged_on": "test", "forms_tried": 0}
+    left = {"depends_on": None, "times_noise": 9.0}
+    said = _summary(report | {"decision": "unexplained", "unexplained": left})
+    assert said.startswith("Something is missing: no form of missing physics was tried.")
 
 
 def test_motor_friction_is_identified_and_estimated() -> None:
