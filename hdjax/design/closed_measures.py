@@ -10,6 +10,7 @@ from hdjax.design.case import Case
 from hdjax.design.measure import Measure, SpeedRange, number
 from hdjax.design.response_measures import outside
 from hdjax.drive import Drive, restoring
+from hdjax.noise import root
 from hdjax.parameters import Scalar
 from hdjax.where import where
 
@@ -88,6 +89,11 @@ class ResonanceDistance(SpeedRange):
     held: bool = False
     at_load: bool = False
 
+    def refuse(self, case: Case) -> None:
+        super().refuse(case)
+        if not self.order > 0.0:
+            raise ValueError(f"`resonance_distance` must have an order above zero, but has {self.order:g}")
+
     def __call__(self, case: Case) -> Array:
         d = case.drive
         # With a stiff servo on the motor, the load oscillates on the spring.
@@ -100,7 +106,8 @@ class Bistability(Measure):
     scales; below 1 there are no folds.
 
     `A_c^2 = 32 mu^3 omega_0 / (9 sqrt(3) |alpha|)` (Nayfeh and Mook 1979, section 4.1, where the response curve first
-    has a vertical tangent). Smooth where folds are born, which [`FoldDistance`][] is not.
+    has a vertical tangent). Smooth where folds are born, which [`FoldDistance`][] is not. Zero for a linear drive,
+    where its infinite slope by alpha counts as zero.
     """
 
     name: ClassVar[str] = "bistability"
@@ -111,4 +118,8 @@ class Bistability(Measure):
         d, torques = case.drive, case.excitation
         A = d.error_forcing(torques.amplitude, torques.load_amplitude)
         least = 32.0 * d.mu**3 * d.omega_0 / (9.0 * jnp.sqrt(3.0))
-        return jnp.abs(A) * jnp.sqrt(jnp.abs(d.alpha) / least)
+        return jnp.abs(A) * root(jnp.abs(d.alpha) / least)
+
+    def refuse(self, case: Case) -> None:
+        if not case.drive.mu > 0.0:
+            raise ValueError(f"`bistability` needs damping, but B_sp is {case.drive.B_sp:g}: any forcing would do")

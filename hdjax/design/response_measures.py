@@ -189,6 +189,11 @@ class FoldDistance(ResponseMeasure):
     rotating: bool = False
     reach: Scalar = number(2.0)
 
+    def refuse(self, case: Case) -> None:
+        super().refuse(case)
+        if not self.reach > 1.0:
+            raise ValueError(f"`fold_distance` must have a reach above 1, but has {self.reach:g}")
+
     @property
     def looked_at(self) -> Range:
         return Range(self.slow / self.reach, self.fast * self.reach)

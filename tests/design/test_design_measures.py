@@ -116,6 +116,12 @@ def test_bistability_begins_at_the_forcing_with_three_first_order_amplitudes():
     assert not three_roots(A / ratio * 0.99) and three_roots(A / ratio * 1.02)
 
 
+def test_bistability_of_a_linear_drive_is_zero_with_slopes():
+    found, slopes, _ = value_and_slopes(Bistability(), case(amplitude=0.2), ("K", "B_sp"))
+    assert found == 0.0
+    np.testing.assert_array_equal(slopes, 0.0)
+
+
 def test_settling_time_of_a_linear_drive_follows_its_damping():
     """The swing's energy falls by mu on average: `2 log(twist/band)/mu`."""
     twist, band = 5.0 / 7160.0, 1e-5
@@ -224,6 +230,9 @@ def test_largest_twist_from_rest_is_one_to_two_steady_amplitudes():
         (MEASURES["peak_error"](slow=100.0, fast=50.0), case(amplitude=1.0), "0 < slow < fast"),
         (MEASURES["peak_error"](slow=50.0, fast=100.0), case(), "needs a torque"),
         (MEASURES["loss"](slow=50.0, fast=100.0, rotating=True), case(), "needs a kinematic error"),
+        (MEASURES["fold_distance"](slow=50.0, fast=100.0, reach=1.0), case(amplitude=1.0), "a reach above 1"),
+        (ResonanceDistance(50.0, 100.0, order=0.0), case(), "an order above zero"),
+        (Bistability(), case().replace({"B_sp": 0.0}), "`bistability` needs damping"),
         (SettlingTime(0.0, 1e-5), case(), "must have a torque"),
         (LargestTwist(100.0, 1.0), case(amplitude=1.0), "raise rate"),
         (IdentificationTime(2000.0, 1.0, 0.0), case(amplitude=1.0), "positive noise"),
