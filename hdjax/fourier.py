@@ -39,8 +39,10 @@ class FourierSeries(eqx.Module):
 
     @property
     def phases(self) -> Float[Array, "*coordinates harmonics"]:
-        """`psi_k` of `B_k cos(k omega t + psi_k)` [rad]."""
-        return jnp.arctan2(-self.sine, self.cosine)
+        """`psi_k` of `B_k cos(k omega t + psi_k)` [rad]; zero where B_k is."""
+        # Where there is no wave, the derivative would be NaN, and with it a gradient of the others.
+        there = (self.cosine != 0.0) | (self.sine != 0.0)
+        return jnp.arctan2(jnp.where(there, -self.sine, 0.0), jnp.where(there, self.cosine, 1.0))
 
     def __call__(self, t: Array) -> Array:
         """The function at times of any shape; coordinates come last."""

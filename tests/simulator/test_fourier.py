@@ -104,6 +104,16 @@ def test_harmonic_series_agrees_with_the_sum_of_cosines():
     np.testing.assert_allclose(harmonic_series(2.0, 3.0)(jnp.asarray(t)), 3 * np.cos(2 * t), atol=1e-14)
 
 
+def test_amplitudes_and_phases_have_gradients_beside_a_vanishing_harmonic():
+    def wave(a):
+        return FourierSeries(1.0, jnp.zeros(()), jnp.stack([3.0 * a, 0.0 * a]), jnp.stack([4.0 + 0.0 * a, 0.0 * a]))
+
+    # B = hypot(3 a, 4) and psi = -atan2(4, 3 a), at a = 1.
+    assert float(jax.grad(lambda a: wave(a).amplitudes[0])(1.0)) == pytest.approx(9.0 / 5.0)
+    assert float(jax.grad(lambda a: wave(a).phases[0])(1.0)) == pytest.approx(12.0 / 25.0)
+    assert float(wave(1.0).phases[1]) == 0.0
+
+
 def test_padding_keeps_the_values_and_the_first_harmonics():
     wave = series(1.5, np.arange(18.0).reshape(2, 9))
     t = jnp.linspace(0.0, 3.0, 5)
