@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hdjax.drive import Drive
 from hdjax.dynamics import TwoInertiaModel
-from hdjax.effects import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
+from hdjax.effects import ActuatorEffect, Effect, Motion, MotorSideEffect, Scales
 from hdjax.fourier import FourierSeries, fourier_series, harmonic_series
 from hdjax.parameters import Scalar, as_scalar, parameter
 from hdjax.simulate import Trajectory, simulate
@@ -71,13 +71,13 @@ def feedforward(
         samples: of a revolution at which forces are evaluated; above twice the harmonics.
 
     Raises:
-        ValueError: an effect has memory or depends on the output angle.
+        ValueError: an effect has memory, acts on a logged torque, or depends on the output angle.
     """
     for effect in model.effects:
-        if effect.states or isinstance(effect, LoadSideEffect) or "theta_l" in effect.angles:
-            raise ValueError(
-                f"`{effect.name}` has memory or depends on the output angle: no period of a motor revolution"
-            )
+        if effect.states or isinstance(effect, ActuatorEffect):
+            raise ValueError(f"`{effect.name}` has memory or acts on a logged torque: no feedforward can carry it")
+        if "theta_l" in effect.angles:
+            raise ValueError(f"`{effect.name}` turns with the output: its period is not the motor's revolution")
     if samples <= 2 * harmonics:
         raise ValueError(f"`samples` must be above {2 * harmonics}, but is {samples}")
     speed, load_torque = as_scalar(speed), as_scalar(load_torque)

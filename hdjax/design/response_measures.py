@@ -60,8 +60,10 @@ class ResponseMeasure(SpeedRange):
         if not case.drive.mu > 0.0:
             raise ValueError(f"`{self.name}` needs damping, but B_sp is {case.drive.B_sp:g}: no motion would be steady")
         for effect in case.model.effects:
-            if effect.states or isinstance(effect, ActuatorEffect) or (rotating and isinstance(effect, LoadSideEffect)):
+            if effect.states or isinstance(effect, ActuatorEffect):
                 raise ValueError(f"`{self.name}` rests on harmonic balance, which can't carry the effect {effect.name}")
+            if rotating and isinstance(effect, LoadSideEffect):
+                raise ValueError(f"`{self.name}` takes no torque on the load where the motor rotates: {effect.name}")
         if not rotating and not (case.excitation.amplitude != 0.0 or case.excitation.load_amplitude != 0.0):
             raise ValueError(f"`{self.name}` needs a torque: forcing.amplitude and forcing.load_amplitude are zero")
         errors = [e for e in case.model.effects if isinstance(e, MeshGeometryEffect)]

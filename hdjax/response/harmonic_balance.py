@@ -14,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hdjax.dynamics import Model, TwoInertiaModel
-from hdjax.effects import ActuatorEffect, LoadSideEffect
+from hdjax.effects import ActuatorEffect
 from hdjax.fourier import FourierSeries
 from hdjax.parameters import as_scalar
 
@@ -213,7 +213,7 @@ def balance(
             raise ValueError(
                 f"`{effect.name}` has memory or acts on a logged torque: use the time domain (`shoot`, `swept_sine`)"
             )
-        if rotating and (isinstance(effect, LoadSideEffect) or "theta_l" in effect.angles):
+        if rotating and "theta_l" in effect.angles:
             raise ValueError(f"`{effect.name}` turns with the output: its period is not the motor's revolution")
     if rotating and not isinstance(model, TwoInertiaModel):
         raise ValueError("`rotating` needs a TwoInertiaModel: a reduced drive has no motor angle")

@@ -13,10 +13,10 @@ from scipy.integrate import solve_ivp
 from hdjax import Drive, ReducedModel, TwoInertiaModel
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
-from hdjax.effects.friction import MotorFriction
+from hdjax.effects.friction import MotorFriction, ViscousLoadFriction
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.load import GravityLoad
+from hdjax.effects.load import ConstantLoad, GravityLoad
 from hdjax.effects.stiffness import QuadraticStiffness
 from hdjax.fourier import FourierSeries, harmonic_series
 from hdjax.response.harmonic_balance import SteadyState, balance, solve
@@ -218,6 +218,16 @@ def test_rotating_steady_state_over_two_revolutions_equals_that_over_one():
     np.testing.assert_allclose(twice.x.amplitudes[1::2], once.x.amplitudes, atol=1e-6 * float(once.x.largest()))
     np.testing.assert_allclose(twice.x.amplitudes[::2], 0.0, atol=1e-12)
     assert float(twice.mean_torque) == pytest.approx(float(once.mean_torque), rel=1e-9)
+
+
+def test_rotating_drive_carries_friction_and_a_constant_torque_on_the_load():
+    """Without a kinematic error the mesh holds both, and the motor gives an N-th of it."""
+    loaded = TwoInertiaModel(DRIVE, (ViscousLoadFriction(b=0.3), ConstantLoad(constant=-0.1)))
+    found = solve(balance(loaded, harmonics=1, rotating=True), OMEGA)
+    held = 0.3 * OMEGA / float(DRIVE.N) + 0.1
+    assert bool(found.converged)
+    assert float(DRIVE.mesh_torque(found.x.mean, jnp.zeros(()))) == pytest.approx(held, rel=1e-8)
+    assert float(found.mean_torque) == pytest.approx(held / float(DRIVE.N), rel=1e-8)
 
 
 # -- refusals --

@@ -9,8 +9,11 @@ import pytest
 from hdjax import Drive
 from hdjax.compensation import Feedforward, MotorServo, feedforward, run_at_speed
 from hdjax.dynamics import TwoInertiaModel
+from hdjax.effects.actuation import TorqueGain
+from hdjax.effects.friction import LoadFriction
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.load import GravityLoad
 from hdjax.simulate import Trajectory
 
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5e-2, K=7160.0, alpha=1e5, B_sp=0.5)
@@ -103,8 +106,20 @@ def test_feedforward_carries_a_constant_load():
     np.testing.assert_allclose(found.correction.mean, 50.0 * x, rtol=1e-12)
 
 
-def test_feedforward_refuses_effects_with_memory_and_few_samples():
-    with pytest.raises(ValueError, match="bouc_wen"):
-        feedforward(PLANT.with_effects(BoucWen(k=500.0, memory_twist=1e-4)), 60.0)
+def test_feedforward_overcomes_friction_of_the_load():
+    """The load's friction twists the mesh, and the motor gives an N-th of it."""
+    rubbed = TwoInertiaModel(DRIVE, (LoadFriction(T_c=3.0, b=0.5, transition=1e-3),))
+    found = feedforward(rubbed, 60.0, target="output")
+    friction = 3.0 + 0.5 * 60.0 / 50.0
+    assert bool(found.converged)
+    x = found.dynamic_error.mean
+    assert float(DRIVE.mesh_torque(x, jnp.zeros(()))) == pytest.approx(friction, rel=1e-9)
+    assert float(found.torque.mean) == pytest.approx(friction / 50.0, rel=1e-9)
+
+
+def test_feedforward_refuses_what_it_can_not_carry_and_few_samples():
+    for effect in (BoucWen(k=500.0, memory_twist=1e-4), TorqueGain(gain_error=0.1), GravityLoad(sine=1.0)):
+        with pytest.raises(ValueError, match=effect.name):
+            feedforward(PLANT.with_effects(effect), 60.0)
     with pytest.raises(ValueError, match="samples"):
         feedforward(PLANT, 60.0, harmonics=12, samples=24)
