@@ -144,8 +144,15 @@ class Model(eqx.Module):
         return eqx.tree_at(lambda m: m.effects, self, kept)
 
     def effect(self, name: str) -> Effect:
-        """The effect of that name."""
-        return next(e for e in self.effects if e.name == name)
+        """The effect of that name.
+
+        Raises:
+            ValueError: there is none.
+        """
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise ValueError(f"`{name}` is no effect of this model; there are {[e.name for e in self.effects]}")
 
     def parameters(self) -> dict[str, tuple[Array, ParameterInfo]]:
         """All parameters by dotted path: the drive's by their symbol, an effect's as `name.symbol`."""
@@ -159,13 +166,21 @@ class Model(eqx.Module):
         return self.values((path,))[0]
 
     def values(self, paths: Sequence[str]) -> list[Any]:
-        """The parameters at dotted paths. In `eqx.tree_at` they are placeholders."""
+        """The parameters at dotted paths. In `eqx.tree_at` they are placeholders.
+
+        Raises:
+            ValueError: a path is not one of [`Model.parameters`][].
+        """
         places = [path.rpartition(".") for path in paths]
-        # Not `self.effect`: equinox makes a module of a method at each look-up.
-        return [
-            own_value(next(e for e in self.effects if e.name == of), name) if of else getattr(self.drive, name)
-            for of, _, name in places
-        ]
+        try:
+            # Not `self.effect`: equinox makes a module of a method at each look-up.
+            return [
+                own_value(next(e for e in self.effects if e.name == of), name) if of else getattr(self.drive, name)
+                for of, _, name in places
+            ]
+        except (AttributeError, IndexError, StopIteration, ValueError) as error:
+            known = ", ".join(self.parameters())
+            raise ValueError(f"{list(paths)} must be parameters of this model; there are {known}") from error
 
     def replace(self, values: Mapping[str, ArrayLike]) -> "Model":
         """The same model with other values at the given dotted paths."""
@@ -210,6 +225,10 @@ class TwoInertiaModel(Model):
     effects: tuple[Effect, ...] = ()
     measured: tuple[str, ...] = eqx.field(static=True, default=BOTH_ANGLES)
     motion_states: ClassVar[tuple[str, ...]] = ("theta_m", "theta_l", "omega_m", "omega_l")
+
+    def __check_init__(self):
+        if not self.measured or not set(self.measured) <= set(OUTPUTS):
+            raise ValueError(f"`measured` must be among {', '.join(OUTPUTS)}, but is {self.measured}")
 
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         theta_m, theta_l, omega_m, omega_l = state[0], state[1], state[2], state[3]

@@ -71,8 +71,10 @@ def random_phase_multisine(
         key: source of the phases.
 
     Raises:
-        ValueError: no line is between the two frequencies.
+        ValueError: no line is between the two frequencies, or the period is not above zero.
     """
+    if not period > 0.0:
+        raise ValueError(f"`period` must be above zero, but is {period} s")
     line = 2 * jnp.pi / period
     # The edges are lines of the band, to rounding.
     first, last = int(jnp.ceil(omega_min / line - 1e-9)), int(jnp.floor(omega_max / line + 1e-9))

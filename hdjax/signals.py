@@ -199,7 +199,7 @@ def sampled(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], *, h
     """A signal through samples.
 
     Args:
-        time: sample stamps [s], rising.
+        time: sample stamps [s], rising; two at least.
         values: the samples.
         hold: inter-sample behaviour. `"zero-order"`: keeps the sample until the next one (a digital drive's torque
             command); `"linear"`; `"cubic"`: a cubic spline; `"band-limited"`: the smooth signal without content above
@@ -209,10 +209,14 @@ def sampled(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], *, h
         The signal on `n` intervals; the last one has the median width.
 
     Raises:
-        ValueError: unknown hold.
+        ValueError: unknown hold, stamps that do not rise, or another number of samples.
     """
     if hold not in HOLDS:
         raise ValueError(f"`hold` must be one of {HOLDS}, but is {hold!r}")
+    if np.shape(time) != np.shape(values) or np.ndim(time) != 1:
+        raise ValueError(f"`values` must be as many as the stamps, {np.shape(time)}, but are {np.shape(values)}")
+    if np.size(time) < 2 or not np.all(np.diff(time) > 0.0):
+        raise ValueError("`time` must rise from each of two stamps or more to the next, but does not")
     width = np.diff(time)
     knots = np.append(time, time[-1] + np.median(width))
     build: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {

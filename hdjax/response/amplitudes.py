@@ -134,7 +134,12 @@ def check_amplitudes(
         A: amplitude of the forcing `A cos(omega t)` as an acceleration [rad/s^2], see [`hdjax.Drive.error_forcing`][].
         omega: forcing frequency [rad/s].
         harmonics: of the forcing frequency in harmonic balance.
+
+    Raises:
+        ValueError: the frequency is not above zero.
     """
+    if not omega > 0.0:
+        raise ValueError(f"`omega` must be above zero, but is {omega} rad/s")
     mu, omega_0, alpha = (float(v) for v in (drive.mu, drive.omega_0, drive.alpha))
     kind = resonance_kind(omega_0, omega)
     # Off resonance the super-harmonic's expansion is valid as well, with a third harmonic that is not resonant.

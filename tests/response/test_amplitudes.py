@@ -48,6 +48,11 @@ def test_motion_far_below_resonance_is_stable_and_holds_to_one_percent():
     assert row.verdict == "holds to 1%"
 
 
+def test_amplitudes_without_a_frequency_are_refused():
+    with pytest.raises(ValueError, match="`omega` must be above zero"):
+        check_amplitudes(DRIVE, 0.05, 0.0)
+
+
 @pytest.mark.parametrize(
     "omega", [pytest.param(0.34, marks=pytest.mark.slow), 0.5, 1.02, pytest.param(3.05, marks=pytest.mark.slow)]
 )

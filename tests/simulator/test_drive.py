@@ -167,6 +167,18 @@ def test_replace_changes_only_the_named_parameters():
     assert float(model.get("K")) == 7160.0
 
 
+@pytest.mark.parametrize("path", ("stiffness_2", "backlash.b", "coulomb_friction.b"))
+def test_unknown_names_of_parameters_effects_and_outputs_are_refused(path):
+    model = TwoInertiaModel(hdc_40_050(), (CoulombFriction(v_0=0.1),))
+    for refused in (lambda: model.get(path), lambda: model.replace({path: 1.0})):
+        with pytest.raises(ValueError, match=f"{path}.* must be parameters of this model; there are N, J_m"):
+            refused()
+    with pytest.raises(ValueError, match="`backlash` is no effect of this model; there are .'coulomb_friction'."):
+        model.effect("backlash")
+    with pytest.raises(ValueError, match="`measured` must be among motor_turn, .*, but is .'twist'"):
+        TwoInertiaModel(hdc_40_050(), measured=("twist",))
+
+
 def test_effects_are_added_and_removed():
     model = example_model()
     more = model.with_effects(Backlash(b=1e-5))

@@ -93,6 +93,11 @@ def test_harmonic_of_integers_has_a_gradient():
     np.testing.assert_allclose(slope.amplitude, np.cos(1.5), rtol=1e-12)
 
 
+def test_multisine_without_a_period_is_refused():
+    with pytest.raises(ValueError, match="`period` must be above zero"):
+        random_phase_multisine(rms=1.0, omega_min=1.0, omega_max=50.0, period=0.0, key=jax.random.key(0))
+
+
 @pytest.mark.parametrize(("low", "high"), ((3.2, 6.2), (50.0, 40.0), (0.0, 0.0)))
 def test_multisine_band_without_a_line_is_refused(low, high):
     """Lines at multiples of 2 pi."""

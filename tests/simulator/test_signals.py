@@ -260,6 +260,12 @@ def test_delayed_signal_begins_with_the_first_sample():
     np.testing.assert_allclose(at(late, between(time, 0.5)[:3]), values[0], atol=1e-12)
 
 
+@pytest.mark.parametrize("time", ([0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 1.0], [0.0, np.nan, 1.0]))
+def test_stamps_that_do_not_rise_are_refused(time):
+    with pytest.raises(ValueError, match="`time` must rise"):
+        sampled(np.array(time), np.ones(len(time)), hold="linear")
+
+
 @jax.jit
 def delay_slope(signal: PiecewisePolynomial, by: jax.Array) -> jax.Array:
     return jax.jvp(lambda d: signal.delayed(d).coefficients, (by,), (jnp.ones_like(by),))[1]
