@@ -124,7 +124,7 @@ def _phase_portrait(drive, initial_states, times, points, rtol, atol, max_steps)
 
     states, escaped = jax.vmap(motion)(initial_states)
     x, v = states[..., 0], states[..., 1]
-    furthest = jnp.max(jnp.abs(initial_states[:, 0]))
+    furthest = jnp.max(jnp.abs(x))
     grid = jnp.linspace(-1.0, 1.0, points) * where(jnp.isfinite(edge), 1.25 * edge, furthest)
     damped = drive.mu != 0.0
     pull = drive.stiffness * restoring(grid, drive.alpha)

@@ -105,6 +105,11 @@ def test_phase_portrait_has_the_critical_level_and_the_nullcline():
     np.testing.assert_allclose(undamped.energy, undamped.energy[:, :1] * jnp.ones_like(undamped.energy), rtol=1e-5)
 
 
+def test_phase_portrait_reaches_as_far_as_its_motions():
+    sent = phase_portrait(oscillator(1.0), jnp.tile(jnp.asarray([0.0, 0.5]), (16, 1)), TIMES)
+    assert float(sent.grid[-1]) == float(jnp.max(jnp.abs(sent.x))) > 0.2
+
+
 def test_energy_of_a_drive_equals_that_of_its_reduced_equation():
     drive: Drive = hdc_40_050()
     x, v = jnp.asarray([1e-3, 2e-3]), jnp.asarray([0.1, -0.3])
