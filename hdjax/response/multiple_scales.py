@@ -314,11 +314,6 @@ def _solve_two(J: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
 # result of its equation.
 
 
-def printed_omega_0() -> float:
-    """The natural frequency that the seed states for its Table 1 [rad/s]; its formula gives 385.545."""
-    return 122.5
-
-
 def printed_error_forcing(drive: Drive, T_m: ArrayLike, T_l: ArrayLike) -> Array:
     """`F = (T_m J_l - T_l J_m)/(N J_m J_l)` [rad/s^2]: a factor N is missing on the load torque."""
     T_m, T_l = (jnp.asarray(T, dtype=float) for T in (T_m, T_l))

@@ -58,7 +58,7 @@ class Points:
         return (*self.axes, *self.sample)
 
     def column(self, path: str) -> Float[np.ndarray, " values"] | None:
-        """All values of a parameter; empty if it does not vary."""
+        """All values of a parameter; None if it does not vary."""
         return self.axes.get(path, self.sample.get(path))
 
     def values(self, points: Int[np.ndarray, " points"]) -> dict[str, Float[np.ndarray, " points"]]:
