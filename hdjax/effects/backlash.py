@@ -10,7 +10,7 @@ from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
-# Share of the half-width over which damping sets in beyond the edge; and the divisor without a zone.
+# Share of the half-width over which damping sets in beyond the edge; and what makes the share one without a zone.
 _ONSET, _NOTHING = 0.02, 1e-30
 # Implausible alpha x^2 at the largest twist, where the spring is four times as stiff as in the middle: vendors' tables
 # give 1.2 to 1.6 times.
@@ -69,7 +69,7 @@ class UndampedBacklash(Backlash):
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         beyond = jnp.maximum(jnp.abs(motion.x) - self.b, 0.0)
-        part = jnp.minimum(beyond / (_ONSET * self.b + _NOTHING), 1.0)
+        part = jnp.minimum((beyond + _NOTHING) / (_ONSET * self.b + _NOTHING), 1.0)
         engaged = part * part * (3.0 - 2.0 * part)
         damping = drive.mesh_torque(jnp.zeros_like(motion.x), motion.v)
         return super().torque(motion, drive, state) - (1.0 - engaged) * damping

@@ -11,7 +11,7 @@ from simulated_outputs import BASE, DRIVE, START, STEP, TIME, outputs, rms
 from hdjax import Harmonic, ReducedDrive, ReducedModel, sampled, simulate
 from hdjax.effects import CATALOGUE, Motion, Scales
 from hdjax.effects.actuation import InputDelay
-from hdjax.effects.backlash import Backlash
+from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.friction import CoulombFriction, MotorFriction, StribeckMotorFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.load import GravityLoad
@@ -153,6 +153,12 @@ def test_backlash_imitates_a_strongly_hardening_spring(drive):
         assert 0.5 * x < float(effect.b) < x and float(stiff.alpha) == 0.0
         assert float(torque(x)) == pytest.approx(float(hardening(x)), rel=1e-9)
         assert float(jax.grad(torque)(x)) == pytest.approx(float(jax.grad(hardening)(x)), rel=1e-9)
+
+
+@pytest.mark.parametrize("x", (0.0, 1e-4))
+def test_backlash_of_no_width_leaves_the_damping(x):
+    motion = Motion(x=jnp.asarray(x), v=jnp.asarray(0.2))
+    assert float(UndampedBacklash().torque(motion, DRIVE, jnp.zeros(0))) == 0.0
 
 
 def test_moderately_hardening_spring_is_imitated_by_no_effect():
