@@ -1,7 +1,6 @@
 """Measures of the steady response, by harmonic balance."""
 
 import abc
-import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -19,7 +18,6 @@ from hdjax.design.steady import (
     followed,
     largest_swing,
     motions_at,
-    swing,
     with_system,
 )
 from hdjax.drive import restoring
@@ -123,7 +121,9 @@ class MeshTorque(ResponseMeasure):
     rotating: bool = False
 
     def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
-        size = functools.partial(mesh_twist, case.model) if self.rotating else swing
+        def size(motion: SteadyState) -> Array:
+            return mesh_twist(case.model, motion) if self.rotating else motion.swing
+
         return case.drive.K * restoring(largest_swing(system, self.looked_at, branches, size)[0], case.drive.alpha)
 
 

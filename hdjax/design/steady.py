@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from hdjax.design.case import Case
 from hdjax.dynamics import ReducedModel
-from hdjax.fourier import FourierSeries, harmonic_series
+from hdjax.fourier import harmonic_series
 from hdjax.parameters import Scalar
 from hdjax.response.continuation import Branch, follow
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance
@@ -25,7 +25,6 @@ from hdjax.response.resonance import peak
 from hdjax.where import where
 
 HARMONICS = 5
-_MARGIN = 1e-6
 _ANOTHER = 1e-3
 _CORRECTIONS = 4
 _SOLVED = 1e-7
@@ -75,11 +74,8 @@ def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
     still = jax.lax.stop_gradient(system)
 
     def of_one(start: Array, end: Array) -> Branch:
-        low, high = jnp.minimum(start, end) * (1.0 - _MARGIN), jnp.maximum(start, end) * (1.0 + _MARGIN)
         branch = follow(still, "omega", start, end, points=ranges[0].rows, steps=ranges[0].steps)
-        inside = jnp.cumsum(where((branch.omega < low) | (branch.omega > high), 1, 0)) == 0
-        branch = eqx.tree_at(lambda b: b.valid, branch, branch.valid & inside)
-        return jax.lax.stop_gradient(branch)
+        return jax.lax.stop_gradient(branch.within(jnp.minimum(start, end), jnp.maximum(start, end)))
 
     starts, ends = zip(*((r.slow, r.fast) for r in ranges), strict=True)
     found = jax.vmap(of_one)(jnp.stack([*starts, *ends]), jnp.stack([*ends, *starts]))
@@ -90,12 +86,6 @@ def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
 def with_system(branch: Branch, system: BalancedMotion) -> Branch:
     """A branch whose motions depend on the differentiable system."""
     return eqx.tree_at(lambda b: b.system, branch, system)
-
-
-def swing(motion: SteadyState) -> Float[Array, ""]:
-    """Largest distance of the dynamic error from its mean [rad]."""
-    x = motion.x
-    return FourierSeries(x.omega, jnp.zeros_like(x.mean), x.cosine, x.sine).largest()
 
 
 def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> SteadyState:
@@ -111,7 +101,7 @@ def largest_swing(
     system: BalancedMotion,
     looked_at: Range,
     branches: Branch,
-    size_of: Callable[[SteadyState], Float[Array, ""]] = swing,
+    size_of: Callable[[SteadyState], Float[Array, ""]] = lambda motion: motion.swing,
 ) -> tuple[Float[Array, ""], SteadyState]:
     """The largest swing, or another size, of all steady motions found in a range, stable or not, and the motion.
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
@@ -10,7 +9,6 @@ from hdjax.dynamics import Model
 from hdjax.fourier import FourierSeries
 from hdjax.response.continuation import Branch, frequency_response
 
-_MARGIN = 1e-6
 _SAME = 1e-6
 
 
@@ -34,10 +32,4 @@ def from_both_ends(
         frequency_response(model, forcing, start, end, **options) for start, end in ((slow, fast), (fast, slow))
     )
     met = bool(up.complete & jnp.allclose(up.unknowns[-1], down.unknowns[0], rtol=0.0, atol=_SAME))
-    low, high = jnp.asarray(slow) * (1.0 - _MARGIN), jnp.asarray(fast) * (1.0 + _MARGIN)
-
-    def within(branch: Branch) -> Branch:
-        inside = jnp.cumsum((branch.omega < low) | (branch.omega > high)) == 0
-        return eqx.tree_at(lambda b: b.valid, branch, branch.valid & inside)
-
-    return (within(up),) if met else (within(up), within(down))
+    return tuple(branch.within(slow, fast) for branch in ((up,) if met else (up, down)))

@@ -25,6 +25,7 @@ _SOLVED = 1e-11
 _CORRECTIONS = 2
 _CHORDS = 5
 _ITERATIONS = 8
+_MARGIN = 1e-6
 
 
 class Branch(eqx.Module):
@@ -71,6 +72,12 @@ class Branch(eqx.Module):
     def stable(self) -> Bool[Array, " points"]:
         """Whether no Floquet multiplier lies outside the unit circle."""
         return is_stable(self.multipliers)
+
+    def within(self, slow: ArrayLike, fast: ArrayLike) -> "Branch":
+        """The branch up to where it leaves a range of forcing frequencies [rad/s]; further rows are not valid."""
+        low, high = as_scalar(slow) * (1.0 - _MARGIN), as_scalar(fast) * (1.0 + _MARGIN)
+        inside = jnp.cumsum(where((self.omega < low) | (self.omega > high), 1, 0)) == 0
+        return eqx.tree_at(lambda b: b.valid, self, self.valid & inside)
 
     def at(self, value: Array) -> BalancedMotion:
         """The system at a value of the parameter."""

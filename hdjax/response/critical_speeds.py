@@ -7,13 +7,10 @@ catalogue): the first speed to avoid is half the natural frequency.
 import dataclasses
 from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from hdjax.drive import Drive
-from hdjax.fourier import FourierSeries
 from hdjax.response.continuation import Branch
 
 ORDERS = (1, 2, 4)
@@ -66,15 +63,6 @@ def critical_speeds(drive: Drive, orders: Sequence[int] = ORDERS) -> list[Critic
     return sorted(found, key=lambda c: c.speed)
 
 
-def swing(branch: Branch) -> Float[Array, " points"]:
-    """Largest distance of the dynamic error from its mean, by row [rad]."""
-
-    def of_one(x: FourierSeries) -> Array:
-        return FourierSeries(x.omega, jnp.zeros_like(x.mean), x.cosine, x.sine).largest()
-
-    return jax.vmap(of_one)(branch.steady_states.x)
-
-
 def can_persist(branch: Branch) -> Bool[Array, " points"]:
     """Which motions of a branch can persist, by row.
 
@@ -100,7 +88,8 @@ def speeds_to_avoid(*branches: Branch, limit: float) -> list[SpeedBand]:
 
 def _bands(branch: Branch, limit: float) -> list[SpeedBand]:
     """Bands of one branch, a run of its rows each."""
-    speed, size, amplitudes = (np.asarray(a) for a in (branch.omega, swing(branch), branch.steady_states.x.amplitudes))
+    motions = branch.steady_states
+    speed, size, amplitudes = (np.asarray(a) for a in (branch.omega, motions.swing, motions.x.amplitudes))
     lasting = np.asarray(can_persist(branch))
     beyond = np.flatnonzero(lasting & (size > limit))
 

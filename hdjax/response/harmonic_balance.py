@@ -45,6 +45,12 @@ class SteadyState(eqx.Module):
         m = self.motion
         return FourierSeries(m.omega, m.mean[..., 0], m.cosine[..., 0, :], m.sine[..., 0, :])
 
+    @property
+    def swing(self) -> Float[Array, "*rows"]:
+        """Largest distance of the dynamic error from its mean [rad]."""
+        x = self.x
+        return FourierSeries(x.omega, jnp.zeros_like(x.mean), x.cosine, x.sine).largest()
+
 
 class BalancedMotion(eqx.Module):
     """The algebraic system of harmonic balance for one model and forcing: `residual(unknowns, omega) = 0`.

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from hdjax.response.amplitudes import GOOD, ErrorMap
 from hdjax.response.attractors import Basins
 from hdjax.response.continuation import Branch
-from hdjax.response.critical_speeds import SpeedBand, can_persist, swing
+from hdjax.response.critical_speeds import SpeedBand, can_persist
 from hdjax.response.fold import Folds
 from hdjax.response.lyapunov import PhasePortrait
 from hdjax.response.modulation import Branches
@@ -212,7 +212,7 @@ def speed_plot(*branches: Branch, bands: Sequence[SpeedBand], limit: float) -> F
     alone = len(branches) == 1
     names = ("steady motion",) if alone else ("reached from below", "reached from above")
     for branch, name, colour, style in zip(branches, names, (STABLE, UP), ("-", "-."), strict=False):
-        speed, size = np.asarray(branch.omega) * _RPM, np.asarray(swing(branch))
+        speed, size = np.asarray(branch.omega) * _RPM, np.asarray(branch.steady_states.swing)
         valid, lasting = np.asarray(branch.valid), np.asarray(can_persist(branch))
         _line(axes, speed, size, valid & ~lasting, UNSTABLE, "--", "unstable")
         _line(axes, speed, size, lasting, colour, style, name)

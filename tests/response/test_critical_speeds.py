@@ -10,7 +10,7 @@ from hdjax import Drive
 from hdjax.dynamics import TwoInertiaModel
 from hdjax.effects.kinematic import KinematicError
 from hdjax.response.continuation import Branch, frequency_response
-from hdjax.response.critical_speeds import can_persist, critical_speeds, speeds_to_avoid, swing
+from hdjax.response.critical_speeds import can_persist, critical_speeds, speeds_to_avoid
 from hdjax.response.plots import speed_plot
 
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5e-2, K=7160.0, B_sp=2.0)
@@ -46,7 +46,8 @@ def test_swing_of_a_linear_drive_agrees_with_the_closed_form():
     found = branch()
     assert bool(found.complete)
     valid = np.asarray(found.valid)
-    np.testing.assert_allclose(np.asarray(swing(found))[valid], closed_form(np.asarray(found.omega)[valid]), rtol=0.02)
+    swing, omega = (np.asarray(a)[valid] for a in (found.steady_states.swing, found.omega))
+    np.testing.assert_allclose(swing, closed_form(omega), rtol=0.02)
 
 
 def test_speed_band_to_avoid_lies_around_half_the_natural_frequency():
@@ -79,7 +80,7 @@ def test_branch_with_folds_gives_one_speed_band():
     (band,) = speeds_to_avoid(softening, limit=3 * ERROR)
     assert band.start == pytest.approx(speed[back].min(), rel=0.01)
     assert band.end > speed[back].max()
-    assert band.amplitude == pytest.approx(np.asarray(swing(softening))[lasting].max())
+    assert band.amplitude == pytest.approx(np.asarray(softening.steady_states.swing)[lasting].max())
     assert can_persist(branch()).all()
 
 
