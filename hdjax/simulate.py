@@ -105,16 +105,19 @@ def simulate(
         The trajectory.
 
     Raises:
-        ValueError: an effect acts on the logged torque, but the forcing is not a sampled signal.
+        ValueError: an effect acts on the logged torque, but the forcing is not a sampled signal; the times do not rise,
+            or the initial state is not one of the model.
         SimulationError: with the [`Ending`][] that names cause and mend.
     """
     require_sampled(model, forcing)
+    times = jnp.asarray(times, dtype=float)
     if initial_state is None:
         initial_state = model.rest()
+    require_start(model, times, initial_state)
     trajectory = _simulate(
         model,
         forcing,
-        jnp.asarray(times, dtype=float),
+        times,
         initial_state,
         load_torque,
         temperature,
@@ -136,6 +139,15 @@ def require_sampled(model: Model, forcing: Callable[[Array], Array]) -> None:
         raise ValueError(
             f"`forcing` must be a sampled signal for {actuators} to act on, but is {type(forcing).__name__}"
         )
+
+
+def require_start(model: Model, times: Array, initial_state: Array) -> None:
+    """Refuse times that do not rise, and a state that is not one of the model."""
+    if times.ndim != 1 or times.size == 0 or not (isinstance(times, Tracer) or np.all(np.diff(times) >= 0.0)):
+        raise ValueError("`times` must rise from the start of the simulation on, but do not")
+    if np.shape(initial_state) != (len(model.state_names),):
+        names, shape = ", ".join(model.state_names), np.shape(initial_state)
+        raise ValueError(f"`initial_state` must have a number for each of {names}, but has the shape {shape}")
 
 
 def raise_failure(trajectory: Trajectory) -> Trajectory:

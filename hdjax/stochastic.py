@@ -15,7 +15,7 @@ from hdjax.effects import Conditions
 from hdjax.noise import Noise
 from hdjax.results import Ending
 from hdjax.signals import PiecewisePolynomial
-from hdjax.simulate import Trajectory, no_torque, raise_failure, read, require_sampled
+from hdjax.simulate import Trajectory, no_torque, raise_failure, read, require_sampled, require_start
 
 _SPREAD = np.sqrt(1.0 / 8.0)
 # A class that diffrax documents but doesn't export.
@@ -130,18 +130,22 @@ def simulate_noisy(
         The trajectory. Behind the model's states, those under coloured noise show its motor and load torque [N m].
 
     Raises:
-        ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal.
+        ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal; where the times
+            do not rise, or the initial state is not one of the model.
         SimulationError: with the [`Ending`][] that names cause and mend.
     """
     require_sampled(model, forcing)
     if substeps < 1:
         raise ValueError(f"`substeps` must be at least 1, but is {substeps}")
+    times = jnp.asarray(times, dtype=float)
+    initial_state = model.rest() if initial_state is None else initial_state
+    require_start(model, times, initial_state)
     trajectory = _simulate_noisy(
         model,
         noise,
-        jnp.asarray(times, dtype=float),
+        times,
         key,
-        model.rest() if initial_state is None else initial_state,
+        initial_state,
         forcing,
         load_torque,
         substeps,

@@ -255,6 +255,20 @@ def test_march_refuses_an_implicit_solver():
 # -- endings --
 
 
+@pytest.mark.parametrize(
+    ("times", "start", "words"),
+    (
+        ([0.0, 0.2, 0.1], [0.0, 0.0], "`times` must rise"),
+        ([0.0, np.nan], [0.0, 0.0], "`times` must rise"),
+        ([], [0.0, 0.0], "`times` must rise"),
+        ([0.0, 0.1], [0.0, 0.0, 0.0], "a number for each of x, v, but has the shape .3,."),
+    ),
+)
+def test_times_that_do_not_rise_and_foreign_states_are_refused(times, start, words):
+    with pytest.raises(ValueError, match=words):
+        simulate(duffing(), constant(0.0), jnp.asarray(times), jnp.asarray(start))
+
+
 def test_every_ending_has_its_own_message():
     messages = [ending.message for ending in Ending]
     assert len(set(messages)) == len(messages)
