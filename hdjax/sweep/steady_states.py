@@ -303,7 +303,9 @@ def _one_period(constants: tuple[Case, Array], values: dict[str, Array]) -> tupl
         series = values.pop(_START)
         equation, push, still, omega = _posed(case.at(values))
         x = jnp.einsum("pk,pkt->t", series, waves)
+        # A drive without a forcing rests: any size will do.
         size = jnp.max(jnp.abs(x))
+        size = jnp.where(size > 0.0, size, 1.0)
 
         def field(angle, y: Array, _: object) -> Array:
             # In radians of the forcing, so that lanes step alike.

@@ -84,6 +84,13 @@ def test_harmonic_phases_follow_the_phase_of_the_forcing():
     np.testing.assert_allclose(turned, np.exp(0.7j * orders)[None] * np.ones_like(turned), atol=1e-9)
 
 
+def test_drive_at_rest_is_checked_like_others():
+    points = Points({"forcing.amplitude": np.array([0.0, 0.3]), "forcing.omega": np.array([0.6, 1.9])})
+    request = Request(points, outputs=("harmonics",))
+    _, check = choose_steady(case(), request)
+    assert check.unfinished == 0 and 0.0 < check.error <= request.tolerance
+
+
 def test_even_harmonics_are_kept_where_any_point_has_an_offset():
     """The pilot may hold points without one only."""
     points = Points({"forcing.omega": np.linspace(0.4, 2.2, 50), "forcing.offset": np.array([0.0, 0.2])})
