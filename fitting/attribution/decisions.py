@@ -289,7 +289,7 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
         accepted = all(c.holds for c in support(this.asked[-1])) if this.asked else False
         if (first is not None) != accepted or (first is not None and first != len(supported) - 1):
             lacking.append(f"round {number}: another candidate would be accepted")
-        elif this.rivals and not last and leader(this.rivals, rules)[0].name != this.asked[-1].name:
+        elif this.rivals and not last and leader(this.rivals, rules)[0].name not in [seen.name for seen in this.asked]:
             lacking.append(f"round {number}: another candidate would lead")
     noise = () if evidence.challenge.left is None else only_noise(evidence.challenge.left, rules)
     checks += noise

@@ -127,6 +127,18 @@ def test_stored_evidence_gives_the_same_decision():
     assert stricter.lacking == "round 1: another candidate would be accepted"
 
 
+def test_replay_accepts_a_round_whose_leader_is_not_supported():
+    """The leader over whole stretches is asked first; here the data support only the next candidate."""
+    rivals = tuple(
+        Rival(name, 1.0, gain, True, 5, 2, True, False) for name, gain in (("spring", 3.0), ("friction", 1.0))
+    )
+    first = RoundEvidence((replace(SEEN, name="spring", strength_errors=1.0), SEEN), rivals=rivals)
+    second = RoundEvidence((replace(SEEN, name="other", p_value=0.5),))
+    assert decide(replace(CASE, rounds=(first, second))).lacking is None
+    unasked = replace(first, asked=(SEEN,))
+    assert decide(replace(CASE, rounds=(unasked, second))).lacking == "round 1: another candidate would lead"
+
+
 def test_every_rule_has_a_unit_a_meaning_and_a_source():
     for rule in fields(RULES):
         assert all(rule.metadata[key] for key in ("unit", "meaning", "source")), rule.name
