@@ -37,12 +37,19 @@ def write_whole(contents: Mapping[Path, str | bytes]) -> None:
             os.unlink(name)
 
 
-def finite(value: Any) -> Any:
-    """The same structure with None (null in JSON) in place of numbers that are not finite."""
+def finite(value: Any, *, infinite: float | None = None) -> Any:
+    """The same structure with None (null in JSON) in place of numbers that are not finite.
+
+    Args:
+        value: a structure of mappings, lists and plain values.
+        infinite: what stands for infinity, with its sign; None if None.
+    """
     if isinstance(value, Mapping):
-        return {k: finite(v) for k, v in value.items()}
+        return {k: finite(v, infinite=infinite) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
+        return [finite(v, infinite=infinite) for v in value]
     if isinstance(value, bool) or not isinstance(value, float | np.floating):
         return value
+    if infinite is not None and math.isinf(value):
+        return math.copysign(infinite, value)
     return float(value) if math.isfinite(value) else None

@@ -4,11 +4,14 @@ Nothing here fits, simulates or decides.
 """
 
 import math
+import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+
+from fitting.files import finite
 
 Question = Literal["instead", "beside"]
 
@@ -201,10 +204,17 @@ class CaseEvidence:
     final: FinalEvidence
 
 
-# Fields that may be infinite, for which JSON has no number. Free runs of a rival may diverge, which no gain offsets.
+# The number that stands for infinity, which JSON lacks.
+_ENDLESS = sys.float_info.max
+# What null means in earlier reports. Free runs of a rival may diverge, which no gain offsets.
 _INFINITE = dict.fromkeys(
     ("removed", "strength_errors", "over_noise", "gain", "training", "selection", "noise", "longer_worse"), math.inf
 ) | {"long_gain": -math.inf}
+
+
+def stored_evidence(case: CaseEvidence) -> dict[str, Any]:
+    """The evidence of a case, as report.json stores it."""
+    return finite(asdict(case), infinite=_ENDLESS)
 
 
 def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
@@ -214,13 +224,13 @@ def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
         stored: `evidence` of its report.json.
     """
     challenge = stored["challenge"]
-    known: dict[str, Any] = _finite(challenge)
+    known: dict[str, Any] = _as_found(challenge)
     known["asked"] = tuple(challenge["asked"])
     for name in ("base", "named", "beside", "instead"):
         known[name] = None if challenge[name] is None else _model(challenge[name])
     left = challenge["left"]
     known["left"] = None if left is None else NoiseEvidence(**left)
-    final = dict(stored["final"])
+    final = _as_found(stored["final"])
     for name in ("names", "excess", "excess_at_first"):
         final[name] = tuple(final[name])
     rounds = tuple(_round(this) for this in stored["rounds"])
@@ -229,19 +239,20 @@ def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
 
 def _round(stored: Mapping[str, Any]) -> RoundEvidence:
     return RoundEvidence(
-        tuple(EffectEvidence(**_finite(seen)) for seen in stored["asked"]),
+        tuple(EffectEvidence(**_as_found(seen)) for seen in stored["asked"]),
         {name: tuple(blocks) for name, blocks in stored["behind"].items()},
-        tuple(Rival(**_finite(rival)) for rival in stored["rivals"]),
+        tuple(Rival(**_as_found(rival)) for rival in stored["rivals"]),
         stored.get("lost", {}),
     )
 
 
 def _model(stored: Mapping[str, Any]) -> ModelEvidence:
-    known = _finite(stored)
+    known = _as_found(stored)
     known["excess"] = tuple(known["excess"])
     return ModelEvidence(**known)
 
 
-def _finite(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields, with infinity where a report has a null."""
-    return {k: _INFINITE[k] if v is None and k in _INFINITE else v for k, v in stored.items()}
+def _as_found(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields, with infinity where it is stored by a number or a null."""
+    known = {k: _INFINITE[k] if v is None and k in _INFINITE else v for k, v in stored.items()}
+    return {k: math.copysign(math.inf, v) if v in (_ENDLESS, -_ENDLESS) else v for k, v in known.items()}

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
+from fitting.attribution.case_evidence import stored_evidence
 from fitting.files import finite
 from fitting.logs import findings
 from fitting.next_experiment.proposal import NextExperiment
@@ -132,7 +133,7 @@ def _of_loop(outcome: Loop, noise: Mapping[str, Any]) -> dict[str, Any]:
         "free_runs_times_expected": outcome.surprise,
         "unknown_remains": outcome.unknown_remains,
         "rules": rules_dict(outcome.checks),
-        "evidence": dataclasses.asdict(outcome.case),
+        "evidence": stored_evidence(outcome.case),
         "noise": dict(noise) | {"memory": outcome.noise_memory, "torque": outcome.torque_noise},
         "setting": setting,
         "search_limited": outcome.limited,

@@ -2,7 +2,7 @@
 
 import ast
 import json
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,10 @@ from fitting.attribution.case_evidence import (
     Rival,
     RoundEvidence,
     case_evidence,
+    stored_evidence,
 )
 from fitting.attribution.decisions import conclude, decide, leader, support, tie
 from fitting.attribution.rules import RULES
-from fitting.files import finite
 from fitting.report.rules import rules_page
 from undeclared.replay import OFF, differing
 
@@ -119,12 +119,26 @@ def test_conclusion_follows_from_names_excess_and_free_runs(change: dict, outcom
 
 
 def test_stored_evidence_gives_the_same_decision():
-    stored = json.loads(json.dumps(finite(asdict(CASE))))
-    again = case_evidence(stored)
+    again = case_evidence(json.loads(json.dumps(stored_evidence(CASE))))
     assert decide(again) == decide(CASE)
     assert decide(CASE).outcome == "effect_found" and decide(CASE).lacking is None
     stricter = decide(again, replace(RULES, significance=1e-3))
     assert stricter.lacking == "round 1: another candidate would be accepted"
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        # The noise model diverges beside a candidate.
+        replace(CASE, rounds=(RoundEvidence((replace(SEEN, over_noise=-np.inf),)),)),
+        # Free runs of the names diverge, and those of the learned term in their place do not.
+        replace(CASE, challenge=replace(CHALLENGE, instead=MODEL, longer_worse=-np.inf)),
+        replace(CASE, final=replace(FINAL, surprise=np.inf, free_runs_explained=-np.inf)),
+    ],
+)
+def test_stored_evidence_keeps_the_sign_of_infinity(case: CaseEvidence):
+    text = json.dumps(stored_evidence(case), allow_nan=False)
+    assert decide(case_evidence(json.loads(text))) == decide(case)
 
 
 def test_replay_accepts_a_round_whose_leader_is_not_supported():
