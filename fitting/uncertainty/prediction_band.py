@@ -101,15 +101,18 @@ def prediction_bands(
     driven = np.zeros(by_parameter.shape[:2])
     if torque_noise > 0.0:
         driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
-    seen = window(fitted.model, stretches)
+    samples = window(fitted.model, stretches)
+    windows = [stretch.beginning(samples).weight for stretch in stretches]
     return tuple(
-        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance, seen)
-        for i, (run, n) in enumerate(zip(runs, map(len, stretches), strict=True))
+        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance, weight)
+        for i, (run, n, weight) in enumerate(zip(runs, map(len, stretches), windows, strict=True))
     )
 
 
 def _slopes(problem: Problem, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states."""
+    """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states. A
+    band is predicted for invalid samples as well."""
+    problem = eqx.tree_at(lambda p: p.segments.weight, problem, replace_fn=jnp.ones_like)
     found = linearise(with_engine(problem), unknowns)
     count, samples, outputs = problem.segments.measured.shape
     shape = (count, samples, outputs, -1)
@@ -127,16 +130,18 @@ def _band(
     driven: np.ndarray,
     white: np.ndarray,
     covariance: np.ndarray,
-    window: int,
+    weight: np.ndarray,
 ) -> PredictionBand:
-    """The band of one run, from the derivatives of its outputs and torque noise; NaN where they diverge."""
+    """The band of one run, from the derivatives of its outputs, torque noise, and the weights of the samples in its
+    initial-state window; NaN where they diverge."""
     variance = np.linalg.inv(white)
     std_noise = float(np.sqrt((variance @ variance.T)[-1, -1]))
     if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
         unknown = np.full(len(by_parameter), np.nan)
         return PredictionBand(run, unknown, unknown, std_noise, driven)
-    seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
-    moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
+    own = white * weight[:, None, None]
+    seen = (own @ by_state[: weight.size]).reshape(-1, by_state.shape[2])
+    moved = (own @ by_parameter[: weight.size]).reshape(-1, by_parameter.shape[2])
     # Scaled, since angles and rates differ by orders of magnitude; a hidden state that the window does not determine is
     # fixed.
     size = np.linalg.norm(seen, axis=0)

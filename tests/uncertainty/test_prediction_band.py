@@ -41,10 +41,12 @@ def band(bands: tuple[PredictionBand, ...]) -> PredictionBand:
     return bands[0]
 
 
-def repeated(fitted: Fit, covariance: np.ndarray, noise: float, draws: int) -> np.ndarray:
+def repeated(
+    fitted: Fit, covariance: np.ndarray, noise: float, draws: int, weight: np.ndarray | None = None
+) -> np.ndarray:
     """Standard deviation of free runs at each sample, over parameters of that covariance and noise in the window."""
     random = np.random.default_rng(3)
-    clean = rig.reduced_experiment(COUNT, seed=5)
+    clean = dataclasses.replace(rig.reduced_experiment(COUNT, seed=5), weight=weight)
     centre = np.asarray(fitted.free.pack(fitted.model))
     # Windows without noise are given a small one, since a fit of the state ends a hundredth of it from its minimum.
     given = COVARIANCE if noise else 1e-4 * COVARIANCE
@@ -89,6 +91,15 @@ def test_band_covers_the_measured_output(band: PredictionBand):
     # The influence of the initial state decays, that of the parameters does not.
     assert np.max(band.std_state[-100:]) < 0.2 * np.max(band.std_state)
     assert np.max(band.std_parameters[-100:]) > 0.2 * np.max(band.std_parameters)
+
+
+def test_band_of_a_slow_channel_equals_the_scatter_of_repeated_free_runs(fitted: tuple[Fit, Uncertainty]):
+    """The window reaches over enough valid samples, and the band over invalid ones."""
+    found, known = fitted
+    weight = (np.arange(COUNT) % 5 == 0).astype(float)
+    unseen = dataclasses.replace(rig.reduced_experiment(COUNT, noise=NOISE, seed=5), weight=weight)
+    band, _ = prediction_bands(found, known, [Stretch(unseen, START, n) for n in STOPS], noise=COVARIANCE)
+    assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 50, weight), 50)
 
 
 def test_bands_of_several_stretches_are_independent(bands: tuple[PredictionBand, ...]):
