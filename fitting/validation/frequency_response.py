@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.linalg import expm
 
 from fitting.estimation.driven_load import twist
 from fitting.estimation.experiment import Experiment, Stretch
-from fitting.estimation.linear_drive import over_a_step, rates_of, readings
+from fitting.estimation.linear_drive import rates_of, readings
 from fitting.validation.welch import cross_density, density
 from hdjax import Drive, Hold, Model, TwoInertiaModel
 
@@ -100,9 +101,8 @@ def frequency_response(
     output = model.measured[-1]
     order = _ORDER.get(output, 0)
     signals = [_differenced(*_on_grid(e, step), order) for e in experiments]
-    slope = _mean_slope(model, experiments)
-    resonance = math.sqrt(slope) / (2 * math.pi)
-    width = abs(float(model.drive.mu)) / (2 * math.pi)
+    linear = _linearised(model, experiments)
+    width = abs(float(linear.drive.mu)) / (2 * math.pi)
     window = _window([u.size for u, _ in signals], step, width)
     signals = [(u, x) for u, x in signals if u.size >= window]
     if window < _SHORTEST or not any(np.ptp(u) > 0 for u, _ in signals):
@@ -125,14 +125,14 @@ def frequency_response(
         coherence=np.clip(np.abs(S_ux) ** 2 / np.maximum(S_uu * S_xx, tiny), 0.0, 1.0),
         input_density=S_uu,
         noise_coherence=np.clip(1.0 - noise_density / np.maximum(S_xx, tiny), 0.0, 1.0),
-        model=_model_response(model, frequency, slope, hold=hold, step=step),
-        resonance=resonance,
+        model=_model_response(linear, frequency, hold=hold, step=step),
+        resonance=float(linear.drive.omega_0) / (2 * math.pi),
         width=width,
         averages=sum(windows),
         source="torque" if isinstance(model.drive, Drive) else "forcing",
         output=output,
         order=order,
-        antiresonance=_antiresonance(model, slope),
+        antiresonance=_antiresonance(linear),
     )
 
 
@@ -159,60 +159,50 @@ def _window(samples: Sequence[int], step: float, width: float) -> int:
     return 1 << int(math.log2(max(allowed, 1.0)))
 
 
-def _mean_slope(model: Model, experiments: Sequence[Experiment]) -> float:
-    """Square of the natural frequency for the stiffness averaged over the measured twist."""
+def _linearised(model: Model, experiments: Sequence[Experiment]) -> Model:
+    """The model with its mean stiffness over the measured twist."""
     x = np.concatenate([twist(Stretch(e, 0, len(e)), model) for e in experiments])
-    hardening = max(1.0 + 3.0 * float(model.drive.alpha) * float(np.mean(x**2)), 0.0)
-    return float(model.drive.omega_0) ** 2 * hardening
+    drive = model.drive
+    hardening = max(1.0 + 3.0 * float(drive.alpha) * float(np.mean(x**2)), 0.0)
+    if isinstance(drive, Drive):
+        return replace(model, drive=replace(drive, K=drive.K * hardening))
+    return replace(model, drive=replace(drive, omega_0=drive.omega_0 * math.sqrt(hardening)))
 
 
-def _antiresonance(model: Model, slope: float) -> float | None:
-    """Frequency at which the linearised load and spring hold the motor still [Hz]; None of another output."""
+def _antiresonance(model: Model) -> float | None:
+    """Frequency at which load and spring hold the motor still [Hz]; None of another output."""
     if model.measured[-1] not in _OF_MOTOR or not isinstance(model, TwoInertiaModel):
         return None
+    return math.sqrt(model.drive.K / model.drive.J_l) / (2 * math.pi)
+
+
+def _linear_system(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives of the state's rate by state and torque, and of the principal output by the state, without alpha."""
     drive = model.drive
-    return math.sqrt(slope * float(drive.K / drive.J_l)) / float(drive.omega_0) / (2 * math.pi)
-
-
-def _input_gain(model: Model) -> float:
-    """Acceleration of the dynamic error per unit of input."""
-    drive = model.drive
-    return float(drive.reduced().gain if isinstance(drive, Drive) else drive.gain)
-
-
-def _model_response(model: Model, frequency: np.ndarray, slope: float, *, hold: Hold, step: float) -> np.ndarray:
-    """Response of the linearised drive's principal output to a sampled torque, from sample to sample."""
-    if model.measured[-1] == "dynamic_error":
-        return _linear_response(frequency, slope, float(model.drive.mu), _input_gain(model), hold=hold, step=step)
-    assert isinstance(model, TwoInertiaModel)
-    reads = readings(model)[-1]
-    if hold not in ("zero-order", "linear"):
+    if isinstance(model, TwoInertiaModel) and model.measured[-1] != "dynamic_error":
         by_state, by_torque = rates_of(model.drive)
-        s = 2j * np.pi * frequency[:, None, None]
-        return np.linalg.solve(s * np.eye(4) - by_state, by_torque[None, :, :1])[:, :, 0] @ reads
-    across, pushes = over_a_step(model.drive, step)
-    z = np.exp(2j * np.pi * frequency * step)[:, None, None]
-    rising = 0.0 if hold == "zero-order" else (z - 1.0) / step
-    driven = pushes[:, :1] + pushes[:, 1:2] * rising
-    return np.linalg.solve(z * np.eye(4) - across, np.broadcast_to(driven, (frequency.size, 4, 1)))[:, :, 0] @ reads
+        return by_state, by_torque[:, :1], readings(model)[-1]
+    reduced = drive.reduced() if isinstance(drive, Drive) else drive
+    by_state = np.array([[0.0, 1.0], [-(float(reduced.omega_0) ** 2), -float(reduced.mu)]])
+    return by_state, np.array([[0.0], [float(reduced.gain)]]), np.array([1.0, 0.0])
 
 
-def _linear_response(
-    frequency: np.ndarray, slope: float, mu: float, gain: float, *, hold: Hold, step: float
-) -> np.ndarray:
-    """Response of `x'' + mu x' + slope x = gain u` to a sampled input, from sample to sample."""
-    s = 2j * np.pi * frequency
+def _model_response(model: Model, frequency: np.ndarray, *, hold: Hold, step: float) -> np.ndarray:
+    """Response of a linear drive's principal output to a sampled torque, from sample to sample."""
+    by_state, by_torque, reads = _linear_system(model)
+    s, count = 2j * np.pi * frequency[:, None, None], len(by_state)
     if hold not in ("zero-order", "linear"):
         # For a smooth input the sampled response equals the continuous one.
-        return gain / (s**2 + mu * s + slope)
-    # One step of x, v, u and the change of u, which a zero-order hold ignores (Franklin, Powell and Workman 1998, 6.3).
-    rates = np.zeros((4, 4))
-    rates[0, 1], rates[1, :3], rates[2, 3] = step, step * np.array([-slope, -mu, gain]), 1.0
+        return np.linalg.solve(s * np.eye(count) - by_state, by_torque[None])[:, :, 0] @ reads
+    # One step of the state, the torque and its change, which a zero-order hold ignores (Franklin, Powell and Workman
+    # 1998, 6.3).
+    rates = np.zeros((count + 2, count + 2))
+    rates[:count, : count + 1], rates[count, count + 1] = step * np.hstack([by_state, by_torque]), 1.0
     across = expm(rates)
-    z = np.exp(s * step)[:, None, None]
-    change = 0.0 if hold == "zero-order" else z - 1.0
-    driven = across[:2, 2:3] + across[:2, 3:] * change
-    return np.linalg.solve(z * np.eye(2) - across[:2, :2], driven)[:, 0, 0]
+    z = np.exp(s * step)
+    change = np.zeros_like(z) if hold == "zero-order" else z - 1.0
+    driven = across[:count, [count]] + across[:count, [count + 1]] * change
+    return np.linalg.solve(z * np.eye(count) - across[:count, :count], driven)[:, :, 0] @ reads
 
 
 def strong_lines(found: FrequencyResponse) -> np.ndarray:

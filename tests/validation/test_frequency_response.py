@@ -232,6 +232,16 @@ def test_motor_only_log_has_antiresonance_and_resonance():
     assert resonance_seen(found) == pytest.approx(RESONANCE, abs=2 * found.resolution)
 
 
+def test_response_of_any_output_is_that_of_the_mean_stiffness():
+    experiment, model = motor_only_log(rig.multisine(COUNT, STEP, rms=0.05, low=0.5, high=40.0, seed=1))
+    harder = dataclasses.replace(model, drive=dataclasses.replace(model.drive, alpha=1e4))
+    found = frequency_response(harder, [experiment], hold="zero-order", noise=1e-4)
+    assert found is not None and found.antiresonance is not None and found.antiresonance > 1.05 * ANTIRESONANCE
+    near = np.abs(found.frequency - found.antiresonance) < 1.0
+    dip = found.frequency[near][np.argmin(np.abs(found.model[near]))]
+    assert dip == pytest.approx(found.antiresonance, abs=found.resolution)
+
+
 @pytest.mark.parametrize(("low", "high"), [(0.5, 0.6 * ANTIRESONANCE), (1.3 * ANTIRESONANCE, 40.0)])
 def test_antiresonance_outside_the_excited_band_is_not_detected(low: float, high: float):
     experiment, model = motor_only_log(rig.multisine(COUNT, STEP, rms=0.05, low=low, high=high, seed=2), noise=1e-3)
