@@ -5,8 +5,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.estimation.estimate import Fit
-from fitting.estimation.linear_response import follow
 from fitting.estimation.whiteness import autocorrelation, left_over
+from fitting.first_order.linearised_fit import motion_states
 from fitting.validation.welch import density
 from hdjax import TwoInertiaModel
 
@@ -54,24 +54,20 @@ class ResidualDiagnostics(eqx.Module):
 
 def diagnose(fit: Fit) -> ResidualDiagnostics:
     """Diagnostics of a fit's residual."""
-    segments = fit.problem.segments
-    weight = np.asarray(segments.weight) > 0
+    weight = np.asarray(fit.problem.segments.weight)[: fit.pieces.sum()] > 0
     residual = left_over(fit)
-    simulated = (np.asarray(segments.measured) - np.asarray(fit.error))[weight]
     step = fit.stretches[0].experiment.time_step
     frequency, power = density(residual, step=step, window=min(2048, residual.size))
-    x = _simulated(fit, "dynamic_error", simulated, weight)
-    quantities = {"x": x, "v": np.gradient(x, step)}
+    states = motion_states(fit)[:, :-1][weight].T
     order = amplitude = np.zeros(0)
     if isinstance(fit.model, TwoInertiaModel):
-        theta_m = _simulated(fit, "motor_turn", simulated, weight) * float(fit.model.drive.N)
-        speed = np.gradient(theta_m, step)
-        # The simulated motion jumps at segment borders.
-        speed = np.clip(speed, *np.quantile(speed, [0.001, 0.999]))
-        quantities |= {"motor angle": np.mod(theta_m, 2 * np.pi), "motor speed": speed}
+        N, (theta_m, theta_l, omega_m, omega_l) = float(fit.model.drive.N), states[:4]
+        quantities = {"x": theta_m / N - theta_l, "v": omega_m / N - omega_l}
+        quantities |= {"motor angle": np.mod(theta_m, 2 * np.pi), "motor speed": omega_m}
         if np.ptp(theta_m) > 4 * np.pi:
             order, amplitude = _ORDERS, order_amplitude(residual, theta_m, _ORDERS)
-    quantities["v"] = np.clip(quantities["v"], *np.quantile(quantities["v"], [0.001, 0.999]))
+    else:
+        quantities = dict(zip(("x", "v"), states, strict=False))
     return ResidualDiagnostics(
         frequency=frequency,
         spectral_density=power,
@@ -82,17 +78,6 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         dependence={name: _dependence(residual, q) for name, q in quantities.items()},
         rms=float(np.sqrt(np.mean(residual**2))),
     )
-
-
-def _simulated(fit: Fit, output: str, simulated: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Simulated values of an output, measured or not, at valid samples."""
-    model = fit.model
-    if output in model.measured:
-        return simulated[:, model.measured.index(output)]
-    assert isinstance(model, TwoInertiaModel)
-    states = follow(fit.at_solution, fit.unknowns).states[:, :-1][weight]
-    turn = states[:, 0] / float(model.drive.N)
-    return turn if output == "motor_turn" else turn - states[:, 1]
 
 
 def order_amplitude(residual: np.ndarray, angle: np.ndarray, orders: np.ndarray) -> np.ndarray:

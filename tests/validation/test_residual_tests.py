@@ -1,12 +1,14 @@
 """The residual tests keep their level on noise of any colour and detect model errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
 import rig
-from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
@@ -164,3 +166,16 @@ def test_true_model_passes_the_residual_tests_and_a_wrong_one_fails():
     poor = short_fit(0, friction=(30.0, 0.1))
     failed = {t.name for t in residual_tests(poor, diagnose(poor)).tests if t.verdict == "failed"}
     assert "whiteness" in failed
+
+
+def test_rate_of_the_motion_does_not_depend_on_which_samples_are_valid():
+    """Differences between the valid samples of a slow channel would be several times too large."""
+    experiment = rig.reduced_experiment(1000, noise=1e-3)
+    slow = replace(experiment, weight=(np.arange(1000) % 5 == 0).astype(float))
+    model, segmentation = rig.reduced_model(), Segmentation(128, substeps=2, count=8)
+    held = Strategy(hold_parameters=True)
+    every, some = (
+        diagnose(fit(model, [Stretch(own, 0, 1000)], base_paths(model), segmentation, strategy=held)).dependence["v"]
+        for own in (experiment, slow)
+    )
+    assert np.ptp(some.centre) == pytest.approx(np.ptp(every.centre), rel=0.2)
