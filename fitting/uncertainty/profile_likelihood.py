@@ -2,7 +2,7 @@
 
 Each point of a profile is a fit of all other parameters with one fixed (Venzon and Moolgavkar 1988). All points are
 computed in parallel by one program. The increase of the sum of squares for 95 % is scaled by the ratio of robust and
-classical variance (Kent 1982), with Student's t in place of a normal distribution.
+classical variance (Kent 1982), with Student's t in place of a normal distribution; by one at least.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from fitting.estimation.engines import residual_and_products, residual_with_bloc
 from fitting.estimation.estimate import Fit
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.uncertainty.normal_law import NORMAL_95
 from fitting.uncertainty.standard_errors import Uncertainty, is_identifiable
 from hdjax.where import where
 
@@ -77,9 +78,11 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
         raise ValueError(f"`path` must be one of {fit.free.paths}, but is {path!r}")
     index = fit.free.paths.index(path)
     estimate = found.estimates[path]
-    # Ratio of the parameter's variance to that of a white residual of unit variance, times t squared.
-    allowed = stdtrit(estimate.degrees_of_freedom, 0.975) ** 2 * _inflation(fit, found, index)
-    reach = np.sqrt(allowed * found.unit_covariance[index, index])
+    # Half the interval of the quadratic approximation, which is no shorter than for a white residual.
+    robust, unit = np.sqrt([found.covariance[index, index], found.unit_covariance[index, index]])
+    classical = estimate.std_classical / abs(float(fit.free.slopes(fit.model)[index]))
+    reach = max(stdtrit(estimate.degrees_of_freedom, 0.975) * robust, NORMAL_95 * classical)
+    allowed = (reach / unit) ** 2
     reach = min(float(reach), _FARTHEST_FIRST)
     problem = eqx.tree_at(
         lambda p: (p.model, p.active), fit.problem, (fit.model, fit.problem.active.at[index].set(0.0))
@@ -130,10 +133,6 @@ def with_profiles(fit: Fit, found: Uncertainty) -> Uncertainty:
             estimates[path] = dataclasses.replace(estimate, ci95=(low, high), identifiable=known, interval="profile")
     # `tree_at` would sort the dictionary, and the covariance is in its order.
     return dataclasses.replace(found, estimates=estimates)
-
-
-def _inflation(fit: Fit, found: Uncertainty, index: int) -> float:
-    return float(found.covariance[index, index] / found.unit_covariance[index, index])
 
 
 class _Walk(eqx.Module):

@@ -63,6 +63,14 @@ def test_profile_interval_is_wider_for_a_coloured_residual(linear_fit: tuple[Fit
     assert lengths[1] == pytest.approx(2.0 * lengths[0], rel=0.02)
 
 
+def test_profile_interval_is_no_shorter_than_for_a_white_residual(linear_fit: tuple[Fit, Uncertainty]):
+    """By chance the spectrum of a short log's residual may promise too small an error."""
+    found, known = linear_fit
+    lucky = dataclasses.replace(known, covariance=0.01 * known.unit_covariance)
+    reach = 1.96 * known.estimates["gain"].std_classical
+    assert np.diff(profile(found, "gain", lucky).ci95)[0] == pytest.approx(2.0 * reach, rel=0.03)
+
+
 def test_profile_interval_equals_that_of_an_independent_search():
     """The reference uses the rig's Runge-Kutta and scipy, on a log that hardly determines its damping."""
     noise = 0.05
