@@ -50,7 +50,7 @@ def own_states(seen: Along, stacked: Effect, proposals: int, before: Memory | No
     if before is not None:
         given[seen.firsts] = np.swapaxes(before.at_ends, 1, 2)
     found = np.empty((segments, samples + 1, *given.shape[1:]))
-    starts = np.flatnonzero(~seen.goes_on)
+    starts = np.flatnonzero(~np.asarray(seen.segments.goes_on))
     lengths = np.diff(np.append(starts, segments))
     for length in np.unique(lengths):
         # Joined segments form one chain.

@@ -7,7 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.linear_response import NODES, WEIGHTS, Followed, acting, inputs_at, polynomial
@@ -45,9 +45,8 @@ class Along(eqx.Module):
         segments: the data that it belongs to.
         at_knots: the motion at each knot.
         between: the motion at the nodes of each interval.
-        pushes: change of the state's rates there by a unit of each quantity that effects add, see [`unit_pushes`][].
-        carried: the resulting change of the state at the interval's end, see [`carried`][].
-        goes_on: whether a segment's data continue those of the one before without a gap.
+        carried: change of the state at the interval's end by a unit of each quantity that effects add, see
+            [`unit_pushes`][].
         firsts: first segment of each stretch.
         ends: segment and knot where each stretch ends.
     """
@@ -57,9 +56,7 @@ class Along(eqx.Module):
     segments: Segments
     at_knots: Motion
     between: Motion
-    pushes: dict[str, Float[np.ndarray, "segments samples nodes states"]]
     carried: dict[str, Float[np.ndarray, "segments samples states nodes"]]
-    goes_on: Bool[np.ndarray, " segments"]
     firsts: Int[np.ndarray, " stretches"]
     ends: Int[np.ndarray, "stretches 2"]
 
@@ -80,10 +77,8 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     conditions = inputs_at(model, segments, PART * segments.width[..., None]).conditions
     at_knots = motions(model, followed.states, conditions_at_knots(segments))
     between = motions(model, followed.between, conditions)
-    pushes = unit_pushes(model, followed.between, conditions)
-    lands = {name: carried(followed, push) for name, push in pushes.items()}
-    goes_on = np.asarray(segments.goes_on)
-    return Along(model, followed, segments, at_knots, between, pushes, lands, goes_on, firsts, ends)
+    lands = {n: carried(followed, push) for n, push in unit_pushes(model, followed.between, conditions).items()}
+    return Along(model, followed, segments, at_knots, between, lands, firsts, ends)
 
 
 def conditions_at_knots(segments: Segments) -> Conditions:
