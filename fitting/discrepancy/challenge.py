@@ -93,11 +93,12 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         seen = replace(seen, longer_worse=worse)
     if instead is not None and beside is not None:
         names = {e.name for e in named.model.effects}
+        one, other = beside.chosen, instead.chosen
         seen = replace(
             seen,
             shown=nonzero_effects(beside.trial.training, names) == names,
-            one_shape=beside.chosen.of == instead.chosen.of
-            and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
+            one_shape=(one.form, one.variables) == (other.form, other.variables)
+            and any(other.variables == (e.one_shape_of,) for e in named.model.effects),
         )
     stand = any(check.holds for check in names_stand(seen))
     return Challenge(named, beside, left, seen) if stand else Challenge(base, instead, None, seen)

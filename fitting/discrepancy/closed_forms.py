@@ -91,16 +91,15 @@ def shapes(curve: LearnedCurve) -> Shapes:
     """Project a learned function on closed forms, beside the influence of the drive's parameters."""
     target = without(curve.value, curve.known)
     forms = [f for f in _forms(curve) if _is_own(f, curve)]
-    single = sorted((_projected(curve, target, (f,)), i) for i, f in enumerate(forms))[::-1]
+    single = sorted((_fitted(curve, target, (f,))[0], i) for i, f in enumerate(forms))[::-1]
     ranked = [forms[i] for _, i in single]
     closest = tuple(_shape(curve, target, (f,)) for f in _distinct(ranked)[:_TOLD])
     if closest and closest[0].explained > _STANDS_FOR:
         return Shapes(closest, closest[0])
     pairs = itertools.combinations(ranked[:_IN_PAIRS], 2)
-    best = max(pairs, key=lambda p: _projected(curve, target, p), default=None)
-    if best is None or _projected(curve, target, best) <= _STANDS_FOR:
-        return Shapes(closest, None)
-    return Shapes(closest, _shape(curve, target, best))
+    both = max(pairs, key=lambda p: _fitted(curve, target, p)[0], default=None)
+    best = None if both is None else _shape(curve, target, both)
+    return Shapes(closest, best if best is not None and best.explained > _STANDS_FOR else None)
 
 
 def _distinct(ranked: list[_Form]) -> list[_Form]:
@@ -198,22 +197,18 @@ def _is_own(form: _Form, curve: LearnedCurve) -> bool:
     return bool(np.all(np.mean(left**2, axis=0) > 1e-6 * np.mean(form.columns**2, axis=0)))
 
 
-def _fitted(curve: LearnedCurve, target: np.ndarray, forms: tuple[_Form, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares fit of a curve by forms, and its residual."""
+def _fitted(curve: LearnedCurve, target: np.ndarray, forms: tuple[_Form, ...]) -> tuple[float, np.ndarray]:
+    """Share of a curve's mean square that forms explain, and their coefficients, by least squares."""
     columns = without(np.concatenate([f.columns for f in forms], axis=1), curve.known)
     scale = np.sqrt(np.mean(columns**2, axis=0))
     found = np.linalg.lstsq(columns / scale, target, rcond=1e-8)[0] / scale
-    return found, target - columns @ found
-
-
-def _projected(curve: LearnedCurve, target: np.ndarray, forms: tuple[_Form, ...]) -> float:
-    _, left = _fitted(curve, target, forms)
-    return 1.0 - float(left @ left) / max(float(target @ target), 1e-300)
+    left = target - columns @ found
+    return 1.0 - float(left @ left) / max(float(target @ target), 1e-300), found
 
 
 def _shape(curve: LearnedCurve, target: np.ndarray, forms: tuple[_Form, ...]) -> Shape:
-    coefficients, _ = _fitted(curve, target, forms)
+    explained, coefficients = _fitted(curve, target, forms)
     labels = [label for f in forms for label in f.labels]
     terms = [f"{c:+.3g} {n}".removesuffix(" 1") for c, n in zip(coefficients, labels, strict=True)]
     families = tuple(dict.fromkeys(f.family for f in forms if f.family is not None))
-    return Shape(" ".join(terms).removeprefix("+"), _projected(curve, target, forms), families)
+    return Shape(" ".join(terms).removeprefix("+"), explained, families)

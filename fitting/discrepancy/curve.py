@@ -110,30 +110,35 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 def _evaluated(model: Model, name: str, uncertainty: Uncertainty, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Value and standard error of a model's learned function at rows of its variables."""
-    paths, covariance = uncertainty.of_effect(name)
 
-    def at(parameters, row):
-        effect = model.replace(dict(zip(paths, parameters, strict=True))).effect(name)
+    def at(moved: Model, row: Array) -> Array:
+        effect = moved.effect(name)
         assert isinstance(effect, Learned)
         zero = jnp.zeros(())
         names = [axis.variable for axis in effect.axes]
         return effect.value(replace(Motion(x=zero, v=zero), **dict(zip(names, row, strict=True))))
 
-    return with_errors(at, jnp.stack(model.values(paths)), covariance, values)
+    return with_errors(at, model, name, uncertainty, values)
 
 
 def with_errors(
-    function: Callable[..., Array], parameters: Array, covariance: np.ndarray, at: np.ndarray
+    function: Callable[[Model, Array], Array], model: Model, name: str, uncertainty: Uncertainty, at: np.ndarray
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-    """Values of a function of parameters and a row, and their standard errors to first order.
+    """Values of a function of a model and a row, and their standard errors to first order due to those of one effect.
 
     Args:
         function: scalar.
-        parameters: estimates.
-        covariance: of the estimates.
+        model: with the estimates.
+        name: of the effect.
+        uncertainty: of the estimates.
         at: rows of arguments.
     """
-    along = jax.vmap(jax.value_and_grad(function), in_axes=(None, 0))
-    value, slopes = (np.asarray(a) for a in along(parameters, jnp.asarray(at)))
+    paths, covariance = uncertainty.of_effect(name)
+
+    def of_parameters(parameters: Array, row: Array) -> Array:
+        return function(model.replace(dict(zip(paths, parameters, strict=True))), row)
+
+    along = jax.vmap(jax.value_and_grad(of_parameters), in_axes=(None, 0))
+    value, slopes = (np.asarray(a) for a in along(jnp.stack(model.values(paths)), jnp.asarray(at)))
     variance = np.einsum("np,pq,nq->n", slopes, covariance, slopes)
     return value, np.sqrt(np.maximum(variance, 0.0))

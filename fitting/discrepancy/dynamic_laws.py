@@ -46,11 +46,6 @@ class MemoryCandidate(eqx.Module):
         """The variable that its hidden states follow."""
         return (self.form.angle,)
 
-    @property
-    def of(self) -> tuple[type[LearnedMemory], tuple[str, ...]]:
-        """Law and variable."""
-        return self.form, self.variables
-
 
 class MemoryScreen(eqx.Module):
     """Screening result of torques with memory.

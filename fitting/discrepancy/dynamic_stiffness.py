@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitting.discrepancy.curve import PLACES, with_errors
 from fitting.first_order.motion import place_of
@@ -47,13 +47,11 @@ def learned_response(name: str, model: Model, uncertainty: Uncertainty) -> Learn
     place = place_of(effect)
     assert place is not None
     omega = np.geomspace(float(effect.omega) / _REACH, float(effect.omega) * _REACH, _POINTS)
-    paths, covariance = uncertainty.of_effect(name)
 
-    def size(parameters, omega):
-        moved = model.replace(dict(zip(paths, parameters, strict=True)))
+    def size(moved: Model, omega: Array) -> Array:
         own = moved.effect(name)
         assert isinstance(own, Lagging)
         return jnp.log(jnp.abs(own.stiffness(omega, moved.drive)))
 
-    found, std = with_errors(size, jnp.stack(model.values(paths)), covariance, omega)
+    found, std = with_errors(size, model, name, uncertainty, omega)
     return LearnedResponse(PLACES[place.name], effect.angle, omega / (2 * np.pi), np.exp(found), std)

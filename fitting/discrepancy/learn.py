@@ -142,8 +142,9 @@ def learn_supported(before: Trial, study: Study) -> Unknown | None:
 def _likeliest(
     found: Sequence[Candidate], best: tuple[Candidate, Trial] | None, before: Trial, study: Study
 ) -> tuple[Candidate, Trial] | None:
-    """The best, inside the equations, of the most likely candidates and the best one so far."""
-    for candidate in _rivals(found):
+    """The best, inside the equations, of the first candidate, a second of nearly the same gain, and the best one so
+    far."""
+    for candidate in (c for c in found[:2] if c.gain > NEARLY * found[0].gain):
         study.progress(f"learning a function of {' and '.join(candidate.variables)}")
         # A full step to the first-order estimate may be far worse than the current model, where the term is zero.
         trial = _refitted(before, candidate, study, np.zeros(len(candidate.effect.c)))
@@ -258,11 +259,6 @@ def _own_motion(model: Model, found: Unknown, fit: Fit | None) -> Float[Array, "
 def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> np.ndarray:
     """The part of values that is orthogonal to known functions."""
     return values - known @ np.linalg.lstsq(known, values, rcond=1e-10)[0]
-
-
-def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates to refit, best first: the best one, and another with nearly the same gain."""
-    return [c for c in found[:2] if c.gain > NEARLY * found[0].gain]
 
 
 def _refitted(before: Trial, candidate: Candidate, study: Study, c: np.ndarray) -> Trial | None:

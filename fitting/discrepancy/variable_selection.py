@@ -86,11 +86,6 @@ class Candidate(eqx.Module):
     effect: Learned
     known: Float[np.ndarray, "instants known"]
 
-    @property
-    def of(self) -> tuple[type[Learned], tuple[str, ...]]:
-        """Place and variables."""
-        return self.form, self.variables
-
 
 class SearchContext(eqx.Module):
     """A linearised fit with data that candidates share.

@@ -248,7 +248,7 @@ def test_encoder_error_is_distinguished_from_a_torque_and_a_mesh_error(
     trial = attempt(rig.drive_model(), study, "zero-order")
     found = learn(trial, study)
     assert found is not None and is_supported(found)
-    assert found.chosen.of == (form, (angle,))
+    assert (found.chosen.form, found.chosen.variables) == (form, (angle,))
     noise = np.log(rig.MOTOR_NOISE / rig.N) + np.log(rig.LOAD_NOISE)
     before, after = (t.held_out.objective for t in (trial, found.trial))
     # A few powers of the load angle approximate the cosine over the small arc, but not to the noise.
@@ -280,7 +280,7 @@ def test_amplifier_saturation_is_learned_as_a_function_of_motor_torque():
     trial = attempt(rig.drive_model(), study, "zero-order")
     found = learn(trial, study)
     assert found is not None and is_supported(found)
-    assert found.chosen.of == (LearnedMotorTorque, ("T_m",))
+    assert (found.chosen.form, found.chosen.variables) == (LearnedMotorTorque, ("T_m",))
     before, after = (t.held_out.objective for t in (trial, found.trial))
     noise = np.log(rig.MOTOR_NOISE / rig.N) + np.log(rig.LOAD_NOISE)
     # A few powers approximate it to an eighth of the noise in each output.
