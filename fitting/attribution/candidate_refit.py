@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, challenge, completed, first_pass, lasting_share, trained
@@ -14,7 +13,7 @@ from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.one_side import contradicts, without_mesh_priors
 from hdjax import Hold, Model
 from hdjax.effects import Effect, Scales
-from hdjax.parameters import as_scalar, own_parameters
+from hdjax.parameters import ParameterInfo, own_parameters
 
 # Iterations after which another hold of the torque must explain more: it changes the motion so little that few suffice.
 _HOLD_STEPS = Strategy(3, reweigh=False, begin_anew_above=np.inf, retry_states=False)
@@ -80,8 +79,7 @@ def _as_sibling(effect: Effect, before: Trial, sibling: Trial) -> Model | None:
     if [e.name for e in others] != [e.name for e in before.model.effects]:
         return None
     theirs = dict(own_parameters(own))
-    for name in (n for n, _ in own_parameters(effect) if n in theirs):
-        effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, getattr(own, name))
+    effect = replace(effect, **{n: getattr(own, n) for n, _ in own_parameters(effect) if n in theirs})
     return _with_form(sibling.model.without_effect(own.name), _with_positive_strengths(effect))
 
 
@@ -133,25 +131,22 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
 
 def _with_form(model: Model, effect: Effect) -> Model:
     """The model with an effect, which takes over the strengths of those that it replaces."""
-    own = {name for name, info in own_parameters(effect) if info.role == "strength"}
     for other in (e for e in model.effects if effect.replaces(e)):
-        for name in (n for n, info in own_parameters(other) if info.role == "strength" and n in own):
-            sum_of_both = getattr(effect, name) + getattr(other, name)
-            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, sum_of_both)
+        shared = _strengths(effect).keys() & _strengths(other).keys()
+        effect = replace(effect, **{n: getattr(effect, n) + getattr(other, n) for n in shared})
         model = model.without_effect(other.name)
     return model.with_effects(effect)
 
 
 def _without_strength(effect: Effect) -> Effect:
-    for name in (n for n, info in own_parameters(effect) if info.role == "strength"):
-        effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(0.0))
-    return effect
+    return replace(effect, **dict.fromkeys(_strengths(effect), 0.0))
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:
     """The effect with every positive strength above zero, so that its logarithm exists."""
-    for name, info in own_parameters(effect):
-        if info.role == "strength" and info.positive:
-            value = float(getattr(effect, name))
-            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(max(value, 1e-6)))
-    return effect
+    positive = [name for name, info in _strengths(effect).items() if info.positive]
+    return replace(effect, **{name: max(float(getattr(effect, name)), 1e-6) for name in positive})
+
+
+def _strengths(effect: Effect) -> dict[str, ParameterInfo]:
+    return {name: info for name, info in own_parameters(effect) if info.role == "strength"}
