@@ -103,7 +103,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
             # A learned term that follows long stretches may replace names that do not.
             instead = learn_supported(base, study)
             if instead is not None:
-                seen_instead = replace(_final_evidence(base, base, instead, covariance), surprise=None)
+                seen_instead = _final_evidence(base, base, instead, covariance)
                 other, side_instead = _fitted_to_the_end(instead.trial.training, seen_instead, study)
                 instead_runs = along_selection(other, instead.trial.hold)
                 if rms_error(instead_runs) < rms_error(runs):

@@ -35,9 +35,10 @@ def better_side(found: Fit) -> Fit | None:
         if leaves_only_noise(one, found, most=RULES.excess) and not any(contradicts(e, one) for e in model.effects)
     ]
     sides = [with_known_priors(one, model.drive.priors) for one in sorted(good, key=stiffness_error)]
-    own, *told = (uncertainty(one).estimates["K"] for one in (found, *sides))
+    told = [uncertainty(one).estimates["K"] for one in sides]
     if not told or max(e.ci95[0] for e in told) > min(e.ci95[1] for e in told):
         return None
+    own = uncertainty(found).estimates["K"]
     agrees = told[0].ci95[0] <= own.value <= told[0].ci95[1]
     return None if agrees and own.std <= told[0].std else sides[0]
 

@@ -151,10 +151,10 @@ RULES = DecisionRules()
 """The default rules."""
 
 
-def rules_table(rules: DecisionRules = RULES) -> list[dict[str, Any]]:
-    """The rules as rows: name, threshold, unit, meaning, source."""
+def rules_table() -> list[dict[str, Any]]:
+    """The default rules as rows: name, threshold, unit, meaning, source."""
     return [
-        {"name": f.name, "threshold": getattr(rules, f.name)}
+        {"name": f.name, "threshold": getattr(RULES, f.name)}
         | {k: f.metadata[k] for k in ("unit", "meaning", "source")}
-        for f in fields(rules)
+        for f in fields(RULES)
     ]

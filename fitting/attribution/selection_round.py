@@ -171,7 +171,11 @@ class _Refits:
         if self.done:
             best = max(self.done.values(), key=lambda trial: trial.gain_over(before))
             near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
-            families = [a.effect.family for a in first if _reaches(self.done.get(a.effect.name), near)]
+            families = [
+                a.effect.family
+                for a in first
+                if (trial := self.done.get(a.effect.name)) is not None and trial.training.objective <= near
+            ]
             self._beside(best, further_forms([*worth, *suspects], families, [*first, *hidden]))
 
     def _refit(self, leads: Sequence[Lead], study: Study, share: float = _HOPELESS) -> None:
@@ -246,10 +250,6 @@ def _supported_first(
 def _on_the_way(before: Trial, best: float, share: float) -> float:
     """The training objective at a share of the best gain; infinite where there is no refit yet."""
     return before.training.objective - share * (before.training.objective - best) if np.isfinite(best) else np.inf
-
-
-def _reaches(trial: Trial | None, objective: float) -> bool:
-    return trial is not None and trial.training.objective <= objective
 
 
 def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:

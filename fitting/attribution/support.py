@@ -9,7 +9,7 @@ from jaxtyping import Float
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import NoiseEvidence
 from fitting.attribution.decisions import only_noise
-from fitting.attribution.rules import RULES, DecisionRules
+from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit, lost
 from fitting.estimation.free_parameters import effect_paths, strength_paths
 from fitting.uncertainty.measurement_noise import MeasurementNoise
@@ -37,9 +37,9 @@ def strength_errors(fit: Fit, names: Collection[str]) -> dict[str, float]:
     return {name: _strength_errors(found, fit.model.effect(name)) for name in names}
 
 
-def nonzero_effects(fit: Fit, names: Collection[str], rules: DecisionRules = RULES) -> set[str]:
+def nonzero_effects(fit: Fit, names: Collection[str]) -> set[str]:
     """Effects with at least one significantly nonzero strength; arguments as in [`strength_errors`][]."""
-    return {name for name, errors in strength_errors(fit, names).items() if errors > rules.strength_errors}
+    return {name for name, errors in strength_errors(fit, names).items() if errors > RULES.strength_errors}
 
 
 def _strength_errors(found: Uncertainty, effect: Effect) -> float:

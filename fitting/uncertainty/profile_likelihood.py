@@ -87,8 +87,7 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
     problem = eqx.tree_at(
         lambda p: (p.model, p.active), fit.problem, (fit.model, fit.problem.active.at[index].set(0.0))
     )
-    floor = _cost(problem, fit.unknowns)
-    walk = _Walk.start(fit.unknowns, index, floor, float(allowed))
+    walk = _Walk.start(fit.unknowns, index, float(_cost(problem, fit.unknowns)), float(allowed))
     for turn in range(_ROUNDS):
         steps = reach * _FURTHER**turn * _GRID
         # Both sides are always extended, so that all rounds share one program.
@@ -207,12 +206,8 @@ def _physical(fit: Fit, index: int, entry: float) -> float:
     return entry * float(fit.free.scale[index])
 
 
-def _cost(problem: Problem, unknowns: Unknowns) -> float:
-    return float(_evaluate(problem, unknowns))
-
-
 @eqx.filter_jit
-def _evaluate(problem: Problem, unknowns: Unknowns) -> Array:
+def _cost(problem: Problem, unknowns: Unknowns) -> Array:
     off = problem.free.off_prior(unknowns.parameters)
     return jnp.sum(residual_with_blocks(unknowns, problem).rows ** 2) + jnp.sum(off**2)
 

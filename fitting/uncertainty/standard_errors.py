@@ -106,7 +106,7 @@ class Uncertainty(eqx.Module):
         return paths, self.correlation[np.ix_(own, own)] * np.outer(std, std)
 
 
-def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise: bool = True) -> Uncertainty:
+def uncertainty(fit: Fit, *, torque_noise: bool = True) -> Uncertainty:
     """Standard errors and intervals of a fit.
 
     The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times the residual
@@ -116,14 +116,13 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
 
     Args:
         fit: the fit.
-        regression: the fit as a linear regression, if already computed.
         torque_noise: whether to consider torque noise; that compiles a program for each form of a model.
     """
     free = fit.free
     if not free.paths:
         empty = np.zeros((0, 0))
         return Uncertainty({}, empty, empty, empty)
-    regression = linearised(fit) if regression is None else regression
+    regression = linearised(fit)
     found = _beside_further(fit, regression)
     if torque_noise:
         found = _described(found, torque_noise_covariance(fit, regression, found.unit))
