@@ -3,6 +3,7 @@
 The equations of motion are written independently in numpy (DESIGN 2.1), without hdjax' simulator.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -68,8 +69,8 @@ def motion_of(joint: Joint, torque: np.ndarray, *, step: float = STEP, substeps:
         theta_m, theta_l, omega_m, omega_l, z = y
         x, v = theta_m / width - theta_l, omega_m / width - omega_l
         tau = joint.K * (x + joint.alpha * x**3) + joint.B_sp * v
-        friction = joint.coulomb * np.tanh(omega_m / rest) + joint.viscous * omega_m
-        held = joint.load_friction * z / joint.bend + joint.gravity * np.sin(theta_l)
+        friction = joint.coulomb * math.tanh(omega_m / rest) + joint.viscous * omega_m
+        held = joint.load_friction * z / joint.bend + joint.gravity * math.sin(theta_l)
         sliding = omega_l - abs(omega_l) * z / joint.bend
         return omega_m, omega_l, (T - friction - tau / width) / joint.J_m, (tau - held) / joint.J_l, sliding
 

@@ -3,6 +3,7 @@
 It uses no equations of hdjax, so that an error there is detected. The torque is held between samples.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,18 +25,37 @@ MOTOR_NOISE, LOAD_NOISE = 1e-5, 1e-6
 
 def rk4(rates: Callable, state: Sequence[float], inputs: np.ndarray, step: float, substeps: int) -> np.ndarray:
     """States at the samples; `rates(state, input)` with the input held over each sample interval."""
+    march = _step_of(len(state))
     h = step / substeps
     y = tuple(float(v) for v in state)
     kept = np.empty((len(inputs), len(y)))
     for i, u in enumerate(inputs.tolist()):
         kept[i] = y
         for _ in range(substeps):
-            k1 = rates(y, u)
-            k2 = rates([a + 0.5 * h * b for a, b in zip(y, k1, strict=True)], u)
-            k3 = rates([a + 0.5 * h * b for a, b in zip(y, k2, strict=True)], u)
-            k4 = rates([a + h * b for a, b in zip(y, k3, strict=True)], u)
-            y = tuple(a + h / 6 * (p + 2 * q + 2 * r + s) for a, p, q, r, s in zip(y, k1, k2, k3, k4, strict=True))
+            y = march(rates, y, u, h)
     return kept
+
+
+@functools.cache
+def _step_of(size: int) -> Callable:
+    """One step for states of this size, written out: loops over the states would take as long as the rates."""
+
+    def states(term: str) -> str:
+        return "(" + "".join(term.format(i=i) + ", " for i in range(size)) + ")"
+
+    source = f"""
+def march(rates, y, u, h):
+    half, sixth = 0.5 * h, h / 6
+    {states("y{i}")} = y
+    {states("p{i}")} = rates(y, u)
+    {states("q{i}")} = rates({states("y{i} + half * p{i}")}, u)
+    {states("r{i}")} = rates({states("y{i} + half * q{i}")}, u)
+    {states("s{i}")} = rates({states("y{i} + h * r{i}")}, u)
+    return {states("y{i} + sixth * (p{i} + 2 * q{i} + 2 * r{i} + s{i})")}
+"""
+    made: dict[str, Callable] = {}
+    exec(source, made)
+    return made["march"]
 
 
 def multisine(count: int, step: float, *, rms: float, low: float, high: float, seed: int = 0) -> np.ndarray:
@@ -89,17 +109,23 @@ def drive_motion(
         substeps: Runge-Kutta steps in each.
     """
     (T_mesh, v_0), (T_motor, w_0), (a, b) = mesh_friction, motor_friction, kinematic
+    wavy = any(kinematic)
 
     def rates(y, T):
+        # Most logs have one effect at most: those that are absent are not computed.
         theta_m, theta_l, omega_m, omega_l = y
-        c, s = math.cos(2 * theta_m), math.sin(2 * theta_m)
-        slope = 2 * (b * c - a * s)
-        x = theta_m / N - theta_l + a * c + b * s
+        x, slope = theta_m / N - theta_l, 0.0
+        if wavy:
+            c, s = math.cos(2 * theta_m), math.sin(2 * theta_m)
+            x, slope = x + a * c + b * s, 2 * (b * c - a * s)
         v = omega_m * (1 / N + slope) - omega_l
-        spring = x - min(max(x, -gap), gap)
-        tau = stiffness * (spring + alpha * spring**3) + damping * v + T_mesh * math.tanh(v / v_0)
-        on_motor = T + torque_bias - T_motor * math.tanh(omega_m / w_0) - (1 / N + slope) * tau
-        return omega_m, omega_l, on_motor / J_M, (tau - gravity * math.sin(theta_l) - tether * theta_l) / J_L
+        spring = x - min(max(x, -gap), gap) if gap else x
+        rubbing = T_mesh * math.tanh(v / v_0) if T_mesh else 0.0
+        tau = stiffness * (spring + alpha * spring**3) + damping * v + rubbing
+        friction = T_motor * math.tanh(omega_m / w_0) if T_motor else 0.0
+        on_motor = T + torque_bias - friction - (1 / N + slope) * tau
+        weight = gravity * math.sin(theta_l) if gravity else 0.0
+        return omega_m, omega_l, on_motor / J_M, (tau - weight - tether * theta_l) / J_L
 
     return rk4(rates, state, torque, step, substeps)
 
@@ -184,7 +210,8 @@ def reduced_motion(
     def rates(y, u):
         x, v = y
         spring = x + quadratic * x**2 + alpha * x**3
-        return v, gain * (u + bias) - mu * v - omega_0**2 * spring - T_c * math.tanh(v / v_0)
+        friction = T_c * math.tanh(v / v_0) if T_c else 0.0
+        return v, gain * (u + bias) - mu * v - omega_0**2 * spring - friction
 
     return rk4(rates, state, forcing, step, substeps)
 
