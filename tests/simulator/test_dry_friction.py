@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,11 +25,20 @@ DRIVE = Drive(N=100.0, J_m=1e-4, J_l=1.0, K=2e4, B_sp=5.0)
 rates = st.floats(-3.0, 3.0)
 
 
+@jax.jit
+def sign_over_step(rate, change, reach, corner):
+    return mean_signs([rate], [change], [[reach]], [corner])[0]
+
+
 def mean_sign(rate, change, reach, corner=0.0):
-    found = mean_signs(
-        *([jnp.asarray(float(v))] for v in (rate, change)), [[jnp.asarray(float(reach))]], [jnp.asarray(corner)]
-    )
-    return float(found[0])
+    return float(sign_over_step(*(jnp.asarray(float(v)) for v in (rate, change, reach, corner))))
+
+
+@eqx.filter_jit
+def marched(model, torque, temperature=None):
+    """States from rest at the samples and at the end, by one step for each sample."""
+    start = jnp.zeros(4)
+    return march(model, torque, None, start, solver=dfx.Tsit5(), substeps=1, temperature=temperature)
 
 
 @given(rate=rates, change=rates, reach=st.floats(0.05, 3.0), corner=st.sampled_from([0.1, 1.0]))
@@ -38,8 +48,8 @@ def test_mean_sign_agrees_with_fine_integration_under_constant_acceleration(rate
     ramp, steps = 2 * np.log(2) * corner, 4000
     now, total = rate, 0.0
     for _ in range(steps):
-        middle = now + (change - reach * np.clip(now / ramp, -1, 1)) / (2 * steps)
-        sign = np.clip(middle / ramp, -1, 1)
+        middle = now + (change - reach * min(max(now / ramp, -1.0), 1.0)) / (2 * steps)
+        sign = min(max(middle / ramp, -1.0), 1.0)
         now, total = now + (change - reach * sign) / steps, total + sign / steps
     assert mean_sign(rate, change, reach, corner) == pytest.approx(total, abs=1e-5)
 
@@ -64,17 +74,15 @@ def test_mean_sign_of_a_sharp_corner_agrees_with_slip_stick_and_reversal():
     assert mean_sign(0.0, 4.0, 1.0) == pytest.approx(1.0, abs=1e-2)
 
 
+SLOPES = [jax.jit(derivative(sign_over_step, argnums=(0, 1, 2, 3))) for derivative in (jax.jacfwd, jax.jacrev)]
+
+
 @pytest.mark.parametrize("corner", [0.0, 0.2])
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 1e-12)])
 def test_derivatives_of_the_mean_sign_are_finite(at, corner):
     """Also at rest, without friction, and at the limit of sticking; in forward and reverse mode."""
-
-    def found(rate, change, reach, corner):
-        return mean_signs([rate], [change], [[reach]], [corner])[0]
-
-    for derivative in (jax.jacfwd, jax.jacrev):
-        slopes = derivative(found, argnums=(0, 1, 2, 3))(*(jnp.asarray(v) for v in (*at, corner)))
-        assert np.all(np.isfinite(slopes))
+    for slopes in SLOPES:
+        assert np.all(np.isfinite(slopes(*(jnp.asarray(v) for v in (*at, corner)))))
 
 
 def test_mean_signs_bring_two_coupled_rates_to_rest_together():
@@ -129,7 +137,7 @@ def test_free_motor_with_friction_stops_at_the_closed_form_angle(substeps):
     def states(start):
         return march(sharp, torque, None, jnp.asarray([0.0, 0.0, start, 0.0]), solver=dfx.Tsit5(), substeps=substeps)[0]
 
-    motion, slope = jax.jvp(states, (omega,), (1.0,))
+    motion, slope = jax.jit(lambda omega: jax.jvp(states, (omega,), (1.0,)))(omega)
     stop, turned = J_M * omega / level, J_M * omega**2 / (2 * level)
     a_step = level / J_M * dt / substeps
     assert stop < 0.8 * count * dt
@@ -146,7 +154,7 @@ def test_motor_sticks_below_the_friction_level_and_slides_above_it():
 
     def end(torque):
         signal = sampled(dt * np.arange(count), np.full(count, torque), hold="zero-order")
-        return np.asarray(march(model, signal, None, jnp.zeros(4), solver=dfx.Tsit5(), substeps=1)[1])
+        return np.asarray(marched(model, signal)[1])
 
     assert np.all(np.abs(end(0.9 * level)[2]) < 1e-4)
     assert end(1.5 * level)[2] == pytest.approx(0.5 * level / J_M * dt * count, rel=1e-4)
@@ -160,7 +168,7 @@ def test_frictions_on_one_rate_stick_with_their_sum():
 
     def rate_under(torque):
         signal, warmth = (sampled(t, np.full(200, v), hold="zero-order") for v in (torque, 310.0))
-        return float(march(model, signal, None, jnp.zeros(4), solver=dfx.Tsit5(), substeps=1, temperature=warmth)[1][2])
+        return float(marched(model, signal, warmth)[1][2])
 
     assert abs(rate_under(0.019)) < 1e-3
     assert rate_under(0.022) == pytest.approx(0.002 / J_M * 0.2, rel=1e-3)
