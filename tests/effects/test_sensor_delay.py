@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -62,15 +63,18 @@ def test_encoder_delay_is_estimated_from_a_log(form: type[SensorDelay], side: in
     assert run.rmse < 2.0 * 10.0 * np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
 
 
+@eqx.filter_jit
+def rates(model: TwoInertiaModel, state: jax.Array, T_m: jax.Array, T_l: jax.Array) -> jax.Array:
+    return model.rates(jnp.asarray(state), T_m, T_l)
+
+
 def test_load_encoder_delay_reads_the_earlier_state():
     """Against the motion of the drive without a torque, integrated backwards in time."""
     drive = eqx.tree_at(lambda d: (d.K, d.B_sp), MODEL.drive, (jnp.asarray(rig.K), jnp.asarray(rig.B_SP)))
     model = TwoInertiaModel(drive)
     state, delay = jnp.asarray(np.array([1.0, 0.018, 3.0, -0.4])), 0.1 / float(drive.omega_0)
     zero = jnp.zeros(())
-    earlier = solve_ivp(
-        lambda _, y: np.asarray(model.rates(jnp.asarray(y), zero, zero)), (0.0, -delay), np.asarray(state), rtol=1e-10
-    ).y[:, -1]
+    earlier = solve_ivp(lambda _, y: rates(model, y, zero, zero), (0.0, -delay), np.asarray(state), rtol=1e-10).y[:, -1]
     read = TwoInertiaModel(drive, (LoadEncoderDelay(delay=delay),), ("load_angle", "load_velocity"))
     moved = np.abs(earlier - np.asarray(state))[[1, 3]]
     # The remainder of the rate, of third order in the delay.
@@ -87,9 +91,7 @@ def test_joint_torque_delay_reads_the_earlier_torque(turn: float):
     model = TwoInertiaModel(drive, (friction,), outputs)
     state, delay = jnp.asarray(np.array([1.0, 0.018, 3.0, -0.4])), turn / float(drive.omega_0)
     T_m, T_l = jnp.asarray(0.5), jnp.asarray(-1.0)
-    earlier = solve_ivp(
-        lambda _, y: np.asarray(model.rates(jnp.asarray(y), T_m, T_l)), (0.0, -delay), np.asarray(state), rtol=1e-12
-    ).y[:, -1]
+    earlier = solve_ivp(lambda _, y: rates(model, y, T_m, T_l), (0.0, -delay), np.asarray(state), rtol=1e-12).y[:, -1]
     inputs = Inputs(T_m, T_l, Conditions())
     read = model.with_effects(JointTorqueDelay(delay=delay)).outputs(state, inputs)
     # A motor's encoder that is late sees the torque as much too early.

@@ -189,6 +189,10 @@ def test_friction_over_the_angle_never_drives_the_motor(form: str):
     ripple = "cosine" if form.startswith("position") else "cos_1"
     effect = next(f for f in CATALOGUE if f.name == form)(T_c=0.1, transition=0.1, **{ripple: 0.3})
     angles, nothing = jnp.linspace(0.0, 2 * np.pi, 101), jnp.zeros(())
-    motions = [Motion(nothing, nothing, a, jnp.asarray(rate)) for a in angles for rate in (-3.0, 3.0)]
-    power = np.array([float(effect.torque(m, DRIVE, jnp.zeros(0)) * m.omega_m) for m in motions])
+
+    @jax.vmap
+    def power_at(angle, rate):
+        return effect.torque(Motion(nothing, nothing, angle, rate), DRIVE, jnp.zeros(0)) * rate
+
+    power = np.concatenate([power_at(angles, jnp.full(angles.shape, rate)) for rate in (-3.0, 3.0)])
     assert np.max(power) <= 0.0 < np.mean(power == 0.0) and np.min(power) < -1.0

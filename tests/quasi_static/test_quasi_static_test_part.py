@@ -1,6 +1,9 @@
 """Test data of quasi-static logs: the error of the model on data that were not fitted."""
 
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,22 +36,32 @@ def report(drive_file: DriveFile, log: Log, *test: Log) -> dict[str, Any]:
     return told.content
 
 
-@pytest.mark.parametrize(
-    ("effect", "options"),
-    [
-        (slow_joints.ripple(3e-5, 2), {"moves": "both ways"}),
-        (slow_joints.sliders(1e-4), {}),
-        (slow_joints.relaxation(0.3, 0.4), {"kind": "triangle"}),
-    ],
-)
+EFFECTS: dict[str, tuple[slow_joints.Effect, dict[str, Any]]] = {
+    "ripple": (slow_joints.ripple(3e-5, 2), {"moves": "both ways"}),
+    "sliders": (slow_joints.sliders(1e-4), {}),
+    "relaxation": (slow_joints.relaxation(0.3, 0.4), {"kind": "triangle"}),
+}
+
+
+def long_log(name: str, **options: Any) -> Log:
+    effect, motion = EFFECTS[name]
+    return slow_joint([effect], **LONG, **motion, **options)[0]
+
+
+@pytest.fixture(scope="module")
+def report_of(drive_file: DriveFile) -> Callable[[str], dict[str, Any]]:
+    """Reports of single long logs by the name of their effect; they must not be changed."""
+    return cache(lambda name: report(drive_file, long_log(name)))
+
+
+@pytest.mark.parametrize("name", EFFECTS)
 @pytest.mark.parametrize("named", [False, True])
 def test_identified_effect_predicts_test_data_to_the_noise(
-    effect: slow_joints.Effect, options: dict[str, Any], named: bool, drive_file: DriveFile
+    name: str, named: bool, drive_file: DriveFile, report_of: Callable[[str], dict[str, Any]]
 ):
-    log, _ = slow_joint([effect], **LONG, **options)
     # A separate log has another zero, and begins at another point of the cycle.
-    other = replace(slow_joint([effect], **LONG, **options, seed=5)[0].rows(700, 4000), name="other")
-    found = report(drive_file, log, *([other] if named else []))
+    other = replace(long_log(name, seed=5).rows(700, 4000), name="other")
+    found = report(drive_file, long_log(name), other) if named else report_of(name)
     assert found["decision"] == "effect_found" and found["judged_on"] == "test"
     before, after = (found[stage]["rmse"]["test"] for stage in ("before", "after"))
     # The rest of the error is the torque's noise.
@@ -65,17 +78,19 @@ def test_friction_is_judged_on_a_log_whose_joint_did_not_move(drive_file: DriveF
 
 
 def test_test_log_must_have_the_signals_of_the_others(drive_file: DriveFile):
-    log, _ = slow_joint([slow_joints.ripple(3e-5, 2)], moves="both ways", **LONG)
+    log = long_log("ripple")
     with pytest.raises(DataError, match="has no motor_angle"):
         report(drive_file, log, replace(log, name="other", motor_angle=None))
 
 
-def test_scrambled_test_data_change_only_test_figures(drive_file: DriveFile):
-    log, _ = slow_joint([slow_joints.ripple(3e-5, 2)], moves="both ways", **LONG)
+def test_scrambled_test_data_change_only_test_figures(
+    drive_file: DriveFile, report_of: Callable[[str], dict[str, Any]]
+):
+    log = long_log("ripple")
     scrambled = log.dynamic_error.copy()
     border = len(log) - round(0.2 * len(log))
     scrambled[border:] = np.random.default_rng(0).permutation(scrambled[border:])
-    one, other = report(drive_file, log), report(drive_file, replace(log, dynamic_error=scrambled))
+    one, other = deepcopy(report_of("ripple")), report(drive_file, replace(log, dynamic_error=scrambled))
     assert one["before"]["rmse"].pop("test") < other["before"]["rmse"].pop("test")
     assert one["after"]["rmse"].pop("test") < other["after"]["rmse"].pop("test")
     for found in (one, other):
@@ -104,8 +119,8 @@ def test_extrapolation_to_larger_torques_is_reported(drive_file: DriveFile):
     assert len(told) == 1
 
 
-def test_report_lists_every_rule_with_its_outcome(drive_file: DriveFile):
-    found = report(drive_file, slow_joint([slow_joints.sliders(1e-4)], **LONG)[0])
+def test_report_lists_every_rule_with_its_outcome(report_of: Callable[[str], dict[str, Any]]):
+    found = report_of("sliders")
     names = {check["name"] for check in found["rules"]}
     assert {"least_gain", "significance", "excess", "explained"} <= names
     assert all(check["outcome"] in ("holds", "fails") and check["statistic"] is not None for check in found["rules"])
