@@ -4,6 +4,7 @@ The base fit fixes K at that value where the other side does not move as the tor
 """
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 import joints
 from fitting.estimation.base_fit import base_fit, is_held
+from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.one_side import fit_of_side, fits_of_sides, held_at, one_side_fit, stiffness_error
@@ -30,8 +32,11 @@ def model_of(joint: joints.Joint) -> TwoInertiaModel:
     return TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=1.0))
 
 
+log_of = functools.cache(joints.log_of)
+
+
 def stretches_of(joint: joints.Joint, **changes) -> tuple[Stretch, ...]:
-    log = dataclasses.replace(joints.log_of(joint), **changes)
+    log = dataclasses.replace(log_of(joint), **changes)
     return whole([experiment_from_log(log, hold="zero-order", N=joint.N)])
 
 
@@ -40,38 +45,41 @@ def stretches() -> tuple[Stretch, ...]:
     return stretches_of(WITH_FRICTION)
 
 
-def test_motor_driven_fit_recovers_stiffness_under_motor_friction(stretches):
+@pytest.fixture(scope="module")
+def motor_driven_fit(stretches) -> Fit:
     found = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches)
     assert found is not None
+    return found
+
+
+def test_motor_driven_fit_recovers_stiffness_under_motor_friction(motor_driven_fit):
+    found = motor_driven_fit
     for path, estimate in uncertainty(found).estimates.items():
         truth = getattr(WITH_FRICTION, path)
         assert abs(estimate.value - truth) < 4.0 * estimate.std, (path, estimate)
     assert uncertainty(found).estimates["K"].std < 0.01 * WITH_FRICTION.K
 
 
-def test_motor_driven_fit_does_not_depend_on_the_motor_torque(stretches):
+def test_motor_driven_fit_does_not_depend_on_the_motor_torque(motor_driven_fit):
     other = stretches_of(WITH_FRICTION, motor_torque=np.sin(np.arange(joints.COUNT)))
-    one, two = (fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), s) for s in (stretches, other))
-    assert one is not None and two is not None
+    one, two = motor_driven_fit, fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), other)
+    assert two is not None
     assert [float(one.model.get(p)) for p in base_paths(one.model)] == [
         float(two.model.get(p)) for p in base_paths(two.model)
     ]
 
 
-def test_motor_driven_fit_includes_the_logged_load_torque():
+def test_motor_driven_fit_includes_the_logged_load_torque(motor_driven_fit):
     """A logged load torque that did not act enters the equation and makes the fit worse."""
     pushed = np.full(joints.COUNT, 0.05 * WITH_FRICTION.K * 1e-2)
     with_load = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches_of(WITH_FRICTION, load_torque=pushed))
-    without = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches_of(WITH_FRICTION))
-    assert with_load is not None and without is not None
-    assert with_load.principal_std > 3.0 * without.principal_std
+    assert with_load is not None
+    assert with_load.principal_std > 3.0 * motor_driven_fit.principal_std
 
 
-def test_motor_driven_residual_grows_with_a_wrong_stiffness(stretches):
-    found = fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), stretches)
-    assert found is not None
-    off = held_at(model_of(WITH_FRICTION).replace({"K": 2.0 * WITH_FRICTION.K}), found)
-    assert off.objective > found.objective + np.log(2.0)
+def test_motor_driven_residual_grows_with_a_wrong_stiffness(motor_driven_fit):
+    off = held_at(model_of(WITH_FRICTION).replace({"K": 2.0 * WITH_FRICTION.K}), motor_driven_fit)
+    assert off.objective > motor_driven_fit.objective + np.log(2.0)
 
 
 def test_base_fit_fixes_parameters_at_the_motor_driven_fit(stretches):
