@@ -1,5 +1,6 @@
 """Readings of a late encoder: whole rows of the delay are found, and moved."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -80,7 +81,7 @@ def test_friction_of_the_mesh_over_many_turns_is_no_delay(seed: int):
 
     def rates(y, wanted):
         x, v = y[0] / N - y[1], y[2] / N - y[3]
-        tau = K * (x + 9e3 * x**3) + 0.6 * v + 0.7 * (1.0 + 0.6 * np.sin(2 * y[0])) * np.tanh(v / 1e-3)
+        tau = K * (x + 9e3 * x**3) + 0.6 * v + 0.7 * (1.0 + 0.6 * math.sin(2 * y[0])) * math.tanh(v / 1e-3)
         return y[2], y[3], (torque(y[0], y[2], wanted) - tau / N) / J_m, tau / J_l
 
     wanted = 0.5 * np.cumsum(size * change)
