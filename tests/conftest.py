@@ -17,6 +17,8 @@ _QUICK = (
     "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
 os.environ.setdefault("XLA_FLAGS", _QUICK)
+# The processes of pytest-xdist inherit this. They occupy all cores, and a waiting thread of OpenBLAS keeps a core busy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # As the command line does, for the same reason.
 gc.set_threshold(200_000)
