@@ -9,7 +9,7 @@ from fitting.errors import InputError
 from fitting.inspection.columns import Column, Table
 from fitting.logs.findings import Finding
 from fitting.logs.time_stamps import TimeBase, time_base
-from fitting.logs.units import UnitError, convert
+from fitting.logs.units import UnitError, convert, is_unit
 
 # Log odds, assumed.
 _NAMED, _MAYBE, _ANONYMOUS, _OTHERWISE, _COUNTER = 3.0, 0.5, -1.0, -6.0, -2.0
@@ -18,7 +18,17 @@ _EPOCH = 8.0
 # Typical sampling rate of loggers: some hundreds of hertz, within a factor of ten; assumed.
 _USUAL_RATE, _RATE_SPREAD = 500.0, np.log(10.0)
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# Clocks that count since a date: its year, their units in seconds, and the seconds from the date to 1970. These are
+# Unix, Windows, .NET, spreadsheets and MATLAB's datenum.
+_DATED = (
+    ("1970", _SECONDS, 0.0),
+    ("1601", {"100 ns": 1e-7}, 11644473600.0),
+    ("the year 1", {"100 ns": 1e-7}, 62135596800.0),
+    ("1900", {"d": 86400.0}, 25569 * 86400.0),
+    ("the year 0", {"d": 86400.0}, 719529 * 86400.0),
+)
 _EPOCHS = (0.9e9, 2.5e9)  # s since 1970, of the years 1998 to 2049
+_SLOWEST = 60.0  # s between samples
 _MOST_BACK = 0.01
 
 
@@ -62,11 +72,13 @@ def guess_time(table: Table) -> TimeGuess:
         return TimeGuess(None, "s", 1.0, ("each channel has separate stamps",))
     # Of several equal time columns, the first represents all.
     scored = [(_log_odds(column), column) for column in table.columns if _first_name(column.name, table) is None]
-    weights = np.exp(np.clip([0.0, *(score for score, _ in scored)], -30.0, 30.0))
     score, column = max(scored, key=lambda pair: pair[0], default=(-np.inf, None))
     if column is None or score <= 0.0:
         why = "a sample rate is stored with the data" if table.sample_rate else "no column rises like a clock"
         return TimeGuess(None, "s", 1.0 if table.sample_rate else 0.0, (why,))
+    # Channels may be stored with a copy of the clock each.
+    rivals = [s for s, c in scored if c is not column and not np.array_equal(c.values, column.values, equal_nan=True)]
+    weights = np.exp(np.clip([0.0, score, *rivals], -30.0, 30.0))
     rising = _rising(column.values)[0]
     reasons = [f"rises in {100 * rising:.4g} % of its rows"]
     if "time" in column.sense.quantities:
@@ -163,17 +175,18 @@ def _log_odds(column: Column) -> float:
     rising, falling, uneven = _rising(column.values)
     if falling > _MOST_BACK:
         return -np.inf
-    known_from = float(np.nanmin(column.values))
     said = column.sense.quantities
-    if said[:1] == ("counter",):
-        name = _COUNTER
-    else:
-        name = _NAMED if said == ("time",) else _MAYBE if "time" in said else _OTHERWISE if said else _ANONYMOUS
+    counts = said[:1] == ("counter",)
+    name = _NAMED if said == ("time",) else _MAYBE if "time" in said else _OTHERWISE if said else _ANONYMOUS
     unit = 0.0
-    if column.unit is not None:
-        unit = _UNIT_FITS if _stated(column) else _UNIT_CONTRADICTS
-    elif any(_EPOCHS[0] < known_from * second < _EPOCHS[1] for second in _SECONDS.values()):
+    if _stated(column) or _since(column.values):
         unit = _UNIT_FITS
+    elif counts or (not said and np.all(np.diff(column.values[known]) == 1.0)):
+        # The number of the row, or of the cycle, tells no rate.
+        return -np.inf
+    elif column.unit is not None and is_unit(column.unit):
+        unit = _UNIT_CONTRADICTS
+    name = _COUNTER if counts else name
     return name + unit + 4.0 * rising + (1.0 if falling == 0 else -2.0) + (1.0 if uneven < 1.0 else -1.0)
 
 
@@ -182,17 +195,32 @@ def _unit(column: Column) -> tuple[str, str]:
     stated = _stated(column)
     if stated is not None:
         return stated, f"the unit '{stated}'"
-    known = column.values[np.isfinite(column.values)]
+    typical, dated = _step(column.values), _since(column.values)
+    sizes = _SECONDS | {unit: second for unit, (second, _) in dated.items()}
+    scores = {}
+    for unit, second in sizes.items():
+        rate = 1.0 / (typical * second) if typical > 0 else np.inf
+        scores[unit] = -0.5 * (np.log(rate / _USUAL_RATE) / _RATE_SPREAD) ** 2 + (_EPOCH if unit in dated else 0.0)
+    best = max(scores, key=lambda unit: scores[unit])
+    rate = 1.0 / (typical * sizes[best])
+    since = f" since {dated[best][1]}" if best in dated else ""
+    return best, f"as {best}{since} the rate is {rate:.4g} Hz"
+
+
+def _step(values: np.ndarray) -> float:
+    """The typical step of a clock."""
+    known = values[np.isfinite(values)]
     step = np.abs(np.diff(known))
     # Repeated stamps are coarse: the mean step is more accurate than the typical one.
-    typical = float(np.ptp(known)) / max(1, len(known) - 1) if (step == 0).mean() > 0.1 else float(np.median(step))
-    scores = {}
-    for unit, second in _SECONDS.items():
-        rate = 1.0 / (typical * second) if typical > 0 else np.inf
-        scores[unit] = -0.5 * (np.log(rate / _USUAL_RATE) / _RATE_SPREAD) ** 2
-        if _EPOCHS[0] < known[0] * second < _EPOCHS[1]:
-            scores[unit] += _EPOCH
-    best = max(scores, key=lambda unit: scores[unit])
-    rate = 1.0 / (typical * _SECONDS[best])
-    since = " since 1970" if _EPOCHS[0] < known[0] * _SECONDS[best] < _EPOCHS[1] else ""
-    return best, f"as {best}{since} the rate is {rate:.4g} Hz"
+    return float(np.ptp(known)) / max(1, len(known) - 1) if (step == 0).mean() > 0.1 else float(np.median(step))
+
+
+def _since(values: np.ndarray) -> dict[str, tuple[float, str]]:
+    """Units in which a clock counts since a usual date: their size [s], and the date's year."""
+    start, step = float(values[np.isfinite(values)][0]), _step(values)
+    return {
+        unit: (second, year)
+        for year, units, before in _DATED
+        for unit, second in units.items()
+        if _EPOCHS[0] < start * second - before < _EPOCHS[1] and step * second < _SLOWEST
+    }

@@ -38,6 +38,11 @@ def drive_log(motion: Motion) -> dict[str, np.ndarray]:
         ("stamp", 1.0, 1.6e9, "s"),
         ("time_us", 1e6, 0.0, "us"),
         ("Time [ms]", 1e3, 0.0, "ms"),
+        # The 15th of January 2024, as counted by Windows, .NET, spreadsheets and MATLAB's datenum.
+        ("time", 1e7, 1.33498e17, "100 ns"),
+        ("Ticks", 1e7, 6.38409e17, "100 ns"),
+        ("Time", 1 / 86400, 45306.25, "d"),
+        ("stamp", 1 / 86400, 739266.25, "d"),
     ],
 )
 def test_time_column_and_its_unit_are_detected(
@@ -46,7 +51,8 @@ def test_time_column_and_its_unit_are_detected(
     columns = {name: start + factor * drive_log["time"]} | {k: v for k, v in drive_log.items() if k != "time"}
     found = fitting.inspect(columns).inspection
     assert (found.time.column, found.time.unit) == (name.partition(" [")[0], unit)
-    assert found.rates[0] == pytest.approx(1000.0, rel=1e-3)
+    # A double holds 6e17 to 13 us.
+    assert found.rates[0] == pytest.approx(1000.0, rel=2e-3)
 
 
 def test_counter_and_whole_seconds_are_not_chosen_as_time_column(drive_log: dict[str, np.ndarray]):
@@ -56,8 +62,11 @@ def test_counter_and_whole_seconds_are_not_chosen_as_time_column(drive_log: dict
     assert found.time.column == "stamp"
 
 
-def test_log_without_a_time_column_asks_for_the_sample_rate(drive_log: dict[str, np.ndarray]):
-    found = fitting.inspect({k: v for k, v in drive_log.items() if k != "time"})
+@pytest.mark.parametrize("counter", [{}, {"sample": 1}, {"cycle count": 4}, {"Unnamed: 0": 1}])
+def test_log_without_a_time_column_asks_for_the_sample_rate(counter: dict[str, int], drive_log: dict[str, np.ndarray]):
+    # The numbers of rows or cycles tell no rate.
+    columns = {name: step * np.arange(len(drive_log["time"])) for name, step in counter.items()}
+    found = fitting.inspect(columns | {k: v for k, v in drive_log.items() if k != "time"})
     assert found.inspection.time.column is None
     assert "[signals] sample_rate" in found.unknown
     assert set(found.inspection.joint.signals) == {"motor_angle", "load_angle", "motor_torque"}
