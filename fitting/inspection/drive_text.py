@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from fitting.inspection.inspection import Inspection, SignalGuess
-from fitting.inspection.unit_evidence import is_counts, si_size
+from fitting.inspection.unit_evidence import is_counts
 from fitting.logs.channels import SI
 
 _ANGLES = ("motor_angle", "load_angle")
@@ -36,7 +36,7 @@ def drive_tables(inspection: Inspection) -> dict[str, Any]:
     drive: dict[str, Any] = {"name": _name(inspection)}
     if joint.ratio is not None and joint.ratio.sure and _known_angles(inspection):
         drive["reduction_ratio"] = _number(joint.ratio.value)
-    columns = {s: _place(joint.signals[s]) for s in _written(inspection)}
+    columns = {s: _place(inspection, joint.signals[s]) for s in _written(inspection)}
     if inspection.time.column is not None:
         columns = {"time": {"column": inspection.time.column, "unit": inspection.time.unit}} | columns
     return {"drive": drive, "columns": columns}
@@ -85,12 +85,13 @@ def drive_file_text(inspection: Inspection, made_by: str) -> str:
     written = _written(inspection)
     for signal in _in_order(inspection.joint.signals):
         guess = inspection.joint.signals[signal]
+        place, open_place = _toml(_place(inspection, guess)), _open_place(inspection, guess)
         if signal in written:
-            lines.append(_with_reason(f"{signal} = {_toml(_place(guess))}", guess))
+            lines.append(_with_reason(f"{signal} = {place}", guess))
         elif _spare(inspection, signal):
-            lines.append(f"# {signal} = {_toml(_place(guess))}  # not needed in addition to the motor torque")
+            lines.append(f"# {signal} = {place}  # not needed in addition to the motor torque")
         else:
-            lines.append(f"# {signal} = {_open_place(guess)}  # {_WHERE_TO_FILL}: {_why_not_written(guess)}")
+            lines.append(f"# {signal} = {open_place}  # {_WHERE_TO_FILL}: {_why_not_written(guess)}")
     lines += [f"# {signal} = ...  # {_WHERE_TO_FILL}: {_WHY_NO_ANGLE}" for signal in _unseen_angles(inspection)]
     lines += _open_lines(inspection)
     return "\n".join(lines) + "\n"
@@ -108,16 +109,7 @@ def _in_order(signals: Iterable[str]) -> list[str]:
 def _written(inspection: Inspection) -> list[str]:
     """The signals whose lines are complete."""
     signals = inspection.joint.signals
-    return [
-        s for s in _in_order(signals) if not _spare(inspection, s) and s != "motor_current" and _is_read(signals[s])
-    ]
-
-
-def _is_read(guess: SignalGuess) -> bool:
-    """Whether the unit is known."""
-    if guess.unit is None:
-        return guess.signal not in _ANGLES
-    return guess.signal not in SI or si_size(guess.unit, SI[guess.signal]) is not None
+    return [s for s in _in_order(signals) if not _spare(inspection, s) and s != "motor_current" and signals[s].is_read]
 
 
 def _spare(inspection: Inspection, signal: str) -> bool:
@@ -139,27 +131,28 @@ def _known_angles(inspection: Inspection) -> bool:
     return all(s in signals for s in _ANGLES)
 
 
-def _place(guess: SignalGuess) -> dict[str, Any]:
-    place: dict[str, Any] = {"column": guess.column}
+def _place(inspection: Inspection, guess: SignalGuess) -> dict[str, Any]:
+    place: dict[str, Any] = {"column": inspection.unique(guess.column)}
     if guess.unit is not None:
         place["unit"] = guess.unit
     return place | ({"sign": -1} if guess.sign < 0 else {})
 
 
-def _open_place(guess: SignalGuess) -> str:
+def _open_place(inspection: Inspection, guess: SignalGuess) -> str:
     """A place in which the unknown part is left to fill in."""
+    column = _toml(inspection.unique(guess.column))
     sign = ", sign = -1" if guess.sign < 0 else ""
     if guess.signal == "motor_current":
         unit = f", unit = {_toml(guess.unit)}" if guess.unit else ""
-        return f"{{ column = {_toml(guess.column)}{unit}{sign}, torque_constant = ... }}"
-    return f'{{ column = {_toml(guess.column)}, unit = "..."{sign} }}'
+        return f"{{ column = {column}{unit}{sign}, torque_constant = ... }}"
+    return f'{{ column = {column}, unit = "..."{sign} }}'
 
 
 def _why_not_written(guess: SignalGuess) -> str:
     if guess.signal == "motor_current":
         return "the torque constant [N m / A] is not known from a log"
     if guess.unit is not None:
-        return f"write the size of one '{guess.unit}', such as \"0.27 N m\""
+        return f"write the size of one '{guess.unit}', such as \"0.27 {SI[guess.signal]}\""
     return 'the unit is unknown; for counts write "rev / 65536" with the counts of a revolution'
 
 
@@ -218,7 +211,7 @@ def _open_lines(inspection: Inspection) -> list[str]:
     for column, shares in inspection.joint.open.items():
         lines.append(f"# {_WHERE_TO_FILL}: {_plain(repr(column))} may be {_listed(shares)}; remove the # from one line")
         unit = inspection.tables[0].column(column).unit
-        place = {"column": column} | ({} if unit is None or is_counts(unit) else {"unit": unit})
+        place = {"column": inspection.unique(column)} | ({} if unit is None or is_counts(unit) else {"unit": unit})
         lines += [f"# {signal} = {_toml(place)}" for signal in shares]
     return lines
 

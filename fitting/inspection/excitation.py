@@ -73,8 +73,8 @@ def _range(inspection: Inspection, signal: str, log: int) -> tuple[float, float,
     _, values = inspection.samples(signal, log)
     guess = inspection.joint.signals[signal]
     unit = SI.get(signal, "A" if signal == "motor_current" else "")
-    if guess.unit is None and signal.endswith("_angle"):
-        unit = "as logged"
+    if not guess.is_read:
+        unit = guess.unit or "as logged"
     return float(values.min()), float(values.max()), unit
 
 
@@ -84,7 +84,7 @@ def _twist(inspection: Inspection, log: int) -> np.ndarray | None:
     both = {"motor_angle", "load_angle"} <= set(joint.signals)
     if not both or rate is None or joint.ratio is None or not joint.ratio.sure:
         return None
-    if joint.signals["load_angle"].unit is None:
+    if not all(joint.signals[side].is_read for side in ("motor_angle", "load_angle")):
         return None
     motor, load = (_even(*inspection.samples(s, log), rate) for s in ("motor_angle", "load_angle"))
     count = min(len(motor), len(load))

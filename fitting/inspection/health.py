@@ -28,8 +28,8 @@ def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
     tables = drive_tables(inspection)
     current = inspection.joint.signals.get("motor_current")
     if current is not None and "motor_torque" not in inspection.joint.signals and "motor_current" in SIGNALS:
-        place = {"column": current.column, "unit": current.unit or "A", "torque_constant": _ANY_CONSTANT}
-        tables["columns"]["motor_current"] = place
+        place = {"column": inspection.unique(current.column), "unit": current.unit or "A"}
+        tables["columns"]["motor_current"] = place | {"torque_constant": _ANY_CONSTANT}
     readable = inspection.joint.kind is not None and _complete(inspection, tables)
     return tuple(
         _of_log(inspection, k, tables) if readable else _of_columns(inspection, k)

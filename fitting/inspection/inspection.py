@@ -14,9 +14,10 @@ from fitting.inspection.reasons import physical_reasons
 from fitting.inspection.relations import Relations
 from fitting.inspection.settling import SURE, RatioGuess, UnitGuess, ratio_of, signs_of, units_of
 from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time, own_stamps
-from fitting.inspection.unit_evidence import si_size
+from fitting.inspection.unit_evidence import is_counts, si_size
 from fitting.inspection.windows import Uniform, scales, uniform
 from fitting.logs.channels import SI
+from fitting.logs.units import convert
 from fitting.logs.unwrapping import unwrapped_angle
 
 _COPY = 5.0  # log odds of proportionality above which a column counts as a copy of another
@@ -56,6 +57,18 @@ class SignalGuess:
     reasons: tuple[str, ...]
     unit_reason: str = ""
     doubts: tuple[str, ...] = ()
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the unit is known; SI is assumed where the file states none, other than for angles."""
+        if self.unit is None:
+            return not self.signal.endswith("_angle")
+        return self.signal not in SI or si_size(self.unit, SI[self.signal]) is not None
+
+    def in_si(self, values: np.ndarray) -> np.ndarray:
+        """Values of the column in SI, without the sign; as logged in a unit of another quantity."""
+        known = self.unit is not None and self.signal in SI and self.is_read
+        return convert(values, self.unit, SI[self.signal]) if known else self.size * values
 
     @property
     def why(self) -> str:
@@ -127,13 +140,18 @@ class Inspection:
         """Samples per second of each log [Hz]; None without a known time unit."""
         return tuple(1.0 / float(np.median(np.diff(c.base.time))) if c.known else None for c in self.clocks)
 
+    def unique(self, column: str) -> str:
+        """The name of a column, numbered where others have the same name."""
+        first = self.tables[0]
+        return f"{column} (1)" if f"{column} (2)" in first.names | first.left_out.keys() else column
+
     def samples(self, signal: str, log: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Stamps [s] and values of a signal of the chosen joint, in SI as guessed, (n,) each, if both are known."""
         guess = self.joint.signals[signal]
         values, own = _samples(self.tables[log], guess.column, self.clocks[log], self.time)
         stamps = self.clocks[log].base.time if own is None else own
         known = np.isfinite(values) & np.isfinite(stamps)
-        return stamps[known], guess.sign * guess.size * values[known]
+        return stamps[known], guess.sign * guess.in_si(values[known])
 
 
 def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Inspection:
@@ -333,7 +351,8 @@ def _signal(
         reasons=tuple(reasons),
     )
     doubts = () if sign is not None or signal in _WITHOUT_SIGN or signal == reference else ("its sign is unknown",)
-    if unit is None or unit.reason == "stated":
+    # A stated unit that is none of an angle must not be replaced by a guess.
+    if unit is None or unit.reason == "stated" or not (column.unit is None or is_counts(column.unit)):
         return replace(guess, doubts=doubts)
     rivals = " or ".join(unit.rivals)
     if unit.confidence < _TOLD_UNIT:

@@ -7,6 +7,7 @@ from fitting.inspection.columns import Column
 from fitting.inspection.unit_evidence import is_counts, si_size
 from fitting.logs.channels import SI
 from fitting.logs.column_names import QUANTITY, NameSense
+from fitting.logs.units import is_unit
 
 # Log odds, assumed; meaning beside each.
 _OWN_NAME = 9.0  # name equal to the signal's
@@ -143,4 +144,5 @@ def _of_unit(column: Column, signal: str) -> tuple[float, Iterable[str]]:
         return (0.0 if QUANTITY[signal] in ("torque", "current") else _WRONG_UNIT), ()
     if si_size(column.unit, _SI[signal]) is not None:
         return _UNIT, (f"its unit '{column.unit}'",)
-    return _WRONG_UNIT, ()
+    # A unit that is not understood contradicts nothing.
+    return (_WRONG_UNIT if is_unit(column.unit) else 0.0), ()

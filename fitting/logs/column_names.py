@@ -97,6 +97,8 @@ _LETTER_SIDES: dict[str, Side] = {"m": "motor", "M": "motor", "l": "load", "L": 
 _UNIT_WORDS = {
     "deg": "deg",
     "degs": "deg",
+    "degree": "deg",
+    "degrees": "deg",
     "rad": "rad",
     "mrad": "mrad",
     "urad": "urad",
@@ -104,6 +106,7 @@ _UNIT_WORDS = {
     "arcsec": "arcsec",
     "rev": "rev",
     "revs": "rev",
+    "revolutions": "rev",
     "turns": "rev",
     "rpm": "rpm",
     "rps": "rev/s",

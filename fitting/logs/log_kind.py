@@ -33,7 +33,7 @@ def refuse_repeated(path: Path, drive_file: DriveFile, table: RawTable) -> None:
         if name in table.repeated:
             raise InputError(
                 f"{path}: the column '{name}' appears twice; give [columns] {signal} of {drive_file.path} its number, "
-                f"or the name '{name} (2)' for the second one"
+                f"or the name '{name} (1)' or '{name} (2)'"
             )
 
 

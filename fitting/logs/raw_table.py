@@ -62,12 +62,14 @@ def places_of(wanted: Iterable[str], names: Sequence[str]) -> dict[str, int]:
     """Indices of the wanted columns, from zero; missing ones are omitted.
 
     Args:
-        wanted: Names such as "torque", which also finds "torque [N m]", or numbers such as "column 3".
+        wanted: Names such as "torque", which also finds "torque [N m]", or numbers such as "column 3". The first of
+            several columns of one name is also "torque (1)".
         names: Of all columns, in order.
     """
     known: dict[str, int] = {}
-    forms = (names, [split_unit(name)[0] for name in names], [numbered(i + 1) for i in range(len(names))])
-    for form in forms:
+    plain = [split_unit(name)[0] for name in names]
+    first = [f"{name} (1)" for name in plain]
+    for form in (names, plain, [numbered(i + 1) for i in range(len(names))], first):
         for place, name in enumerate(form):
             known.setdefault(name, place)
     return {name: known[name] for name in wanted if name in known}

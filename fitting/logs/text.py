@@ -234,7 +234,9 @@ def _header(
     if not rows:
         return _numbered(path, lines, dialect, wanted), [], dialect.first
     has_units = len(rows) > 1 and _are_units(rows[-1][1])
+    # The first cell may be the row's own title.
     units = [cell.strip("[]()") for cell in rows[-1][1]] if has_units else []
+    units = ["" if re.fullmatch("(?:unit|einheit)[a-z]*:?", cell, re.IGNORECASE) else cell for cell in units]
     # A corrupt row of samples may be a word and blanks.
     index, names = max(reversed(rows[:-1] if has_units else rows), key=lambda row: sum(map(bool, row[1])))
     behind = range((rows[-1][0] if has_units else index) + 1, dialect.first)
@@ -282,9 +284,10 @@ def _could_head(cells: list[str], dialect: _Dialect) -> bool:
 def _are_units(cells: list[str]) -> bool:
     filled = [cell for cell in cells if cell]
     known = (
-        r"[\[(].*[\])]|-|n?s|[munµμ]s|sec.*|°.*|deg.*|m?rad.*|rev.*|[mkM]?N\W?m+.*|counts?|inc.*|[mk]?V|rpm|1/min|K|%"
+        r"[\[(].*[\])]|-|n?s|[munµμ]s|sec.*|°.*|deg.*|m?rad.*|rev.*|[mkM]?N\W?m+.*|newton.*|counts?|inc.*|[mk]?V"
+        r"|volts?|m?A|amp.*|rpm|1/min|K|%"
     )
-    return sum(bool(re.fullmatch(known, cell)) for cell in filled) > 0.5 * len(filled)
+    return sum(bool(re.fullmatch(known, cell, re.IGNORECASE)) for cell in filled) > 0.5 * len(filled)
 
 
 def _header_alone(lines: list[str]) -> tuple[str, ...]:

@@ -24,6 +24,8 @@ _SPELLINGS = {
     "U/min": "rpm",
     "r/min": "rpm",
     "rev/min": "rpm",
+    "NM": "N m",
+    "amps": "A",
 }
 # Coherent SI unit and factor of common units, since importing pint takes as long as jax.
 USUAL: dict[str, tuple[str, float]] = {
@@ -54,6 +56,10 @@ _PRODUCT = re.compile(
     r"(?P<number>[-+]?[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]{1,2})?)?\s*(?P<unit>.*?)"
     r"(?:\s*/\s*(?P<counts>[0-9]{1,15})(?:(?:\^|\*\*)(?P<power>[0-9]{1,2}))?)?"
 )
+# Newton metre in one word or with marks; pint takes "Nm" for the textile unit number_meter, and a hyphen for a minus.
+_NEWTON_METRE = re.compile(r"\b([nµμumkM]?)(?:N|newtons?)(?:\s?[-.·⋅]\s?)?([cmk]?)(?:m|met(?:er|re)s?)\b")
+# Pounds and ounces beside a length are those of force.
+_POUND_LENGTH = re.compile(r"(in|ft)[-. ·]?(lb|oz)f?s?|(lb|oz)f?s?[-. ·]?(in|ft)", re.IGNORECASE)
 _LONGEST = 80
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
@@ -94,13 +100,16 @@ def _usual(text: str) -> tuple[str, float] | None:
 
 def _parse(text: str) -> Any:
     """The pint quantity of one unit, e.g. 1/16777216 revolution."""
-    spelled = _SPELLINGS.get(text.strip(), text.strip())
-    spelled = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(_RAISED), spelled)
+    spelled = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(_RAISED), text.strip())
+    spelled = _SPELLINGS.get(spelled, spelled)
     if len(text) > _LONGEST or _is_tower(spelled):
         raise UnitError(f"unit {text[:_LONGEST]!r} is not understood")
     spelled = re.sub(r"°(?![CFK])", "deg", spelled)
-    # pint reads "Nm" as the textile unit number_meter; here it is newton metre.
-    spelled = re.sub(r"\b([nµμumkM]?)N(?:\s?[-.·⋅]\s?)?m\b", r"\1N m", spelled) or "1"
+    spelled = re.sub(r"\b[Dd]eg(?:rees?|\.)?\s*C\b", "degC", spelled)
+    spelled = _NEWTON_METRE.sub(r"\1N \2m", spelled) or "1"
+    pounds = _POUND_LENGTH.fullmatch(spelled)
+    if pounds is not None:
+        spelled = f"force_{'ounce' if 'oz' in spelled.lower() else 'pound'} {(pounds[1] or pounds[4]).lower()}"
     try:
         quantity = _registry().Quantity(spelled)
         finite = bool(np.isfinite(float(quantity.magnitude)))
@@ -131,6 +140,22 @@ def _base_powers(quantity: Any) -> dict[str, float]:
     return {str(n): float(p) for n, p in units._units.items() if n != "count"}
 
 
+def _spelled(text: str, target: str | None = None) -> Any:
+    """The pint quantity of a unit, of what a target measures if one is given; in small letters where it is none as
+    written: "Degrees", "RPM"."""
+    errors = []
+    for spelled in dict.fromkeys((text, text.lower())):
+        try:
+            quantity = _parse(spelled)
+        except UnitError as error:
+            errors.append(error)
+            continue
+        if target is None or _base_powers(quantity) == _base_powers(_parse(target)):
+            return quantity
+        errors.append(UnitError(f"unit {text!r} does not measure what {target!r} does"))
+    raise errors[0]
+
+
 def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
     """Values in `target` units.
 
@@ -151,9 +176,7 @@ def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
     usual = _usual(unit)
     if usual is not None and usual[0] == target:
         return np.asarray(usual[1] * np.asarray(values, dtype=np.float64))
-    quantity, wanted = _parse(unit), _parse(target)
-    if _base_powers(quantity) != _base_powers(wanted):
-        raise UnitError(f"unit {unit!r} does not measure what {target!r} does")
+    quantity, wanted = _spelled(unit, target), _parse(target)
     try:
         scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
         return np.asarray(_registry().Quantity(scaled, quantity.units).m_as(wanted.units))
@@ -186,7 +209,7 @@ def to_base(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     usual = _usual(unit)
     if usual is not None:
         return np.asarray(usual[1] * np.asarray(values, dtype=np.float64)), usual[0]
-    quantity = _parse(unit)
+    quantity = _spelled(unit)
     registry = _registry()
     base = registry.get_base_units(quantity.units)[1]
     scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)

@@ -151,6 +151,21 @@ SHAPES: dict[str, Shape] = {
             "Winding Temperature": ("temperature", "degC", 1),
         },
     ),
+    "units in words and capitals": Shape(
+        lambda s: {
+            "Time [Sec]": s.time,
+            "Motor Angle [Degrees]": _deg(s.motor_angle),
+            "Load Position [DEG]": _deg(s.load_angle),
+            "Motor Speed [RPM]": _rpm(s.motor_velocity),
+            "Torque [Newton-meters]": s.motor_torque,
+        },
+        {
+            "Motor Angle": ("motor_angle", "Degrees", 1),
+            "Load Position": ("load_angle", "DEG", 1),
+            "Motor Speed": ("motor_velocity", "RPM", 1),
+            "Torque": ("motor_torque", "Newton-meters", 1),
+        },
+    ),
     "degrees that nobody states": Shape(
         lambda s: {
             "t": s.time,

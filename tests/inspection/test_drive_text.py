@@ -98,3 +98,31 @@ def test_percent_as_unit_is_left_to_be_filled_in(motion: Motion):
     assert "motor_torque" not in found.drive["columns"]
     assert "the size of one '%'" in found.unknown["[columns] motor_torque"]
     assert '# motor_torque = { column = "motor torque", unit = "..." }  # FILL IN' in found.drive_file()
+
+
+@pytest.mark.parametrize("unit", ["ustep", "V"])
+def test_angle_in_a_unit_that_is_none_is_left_to_be_filled_in(unit: str, motion: Motion):
+    columns = {"t": motion.time, f"motor_angle [{unit}]": motion.motor_angle, "load_angle": motion.load_angle}
+    found = fitting.inspect(columns | {"motor_torque": motion.motor_torque})
+    assert "motor_angle" not in found.drive["columns"]
+    assert f"the size of one '{unit}', such as \"0.27 rad\"" in found.unknown["[columns] motor_angle"]
+    # The range is told in the unit of the log.
+    assert found.excitations[0].ranges["motor_angle"][2] == unit
+
+
+def test_temperature_in_degrees_celsius_is_told_in_kelvin(motion: Motion):
+    columns = SHAPES["own names"].columns(motion) | {"Temperature [°C]": np.linspace(20.0, 30.0, motion.time.size)}
+    low, high, unit = fitting.inspect(columns).excitations[0].ranges["temperature"]
+    assert (low, high, unit) == (pytest.approx(293.15), pytest.approx(303.15), "K")
+
+
+def test_log_with_columns_of_one_name_is_read_with_its_drive_file(motion: Motion, tmp_path: Path):
+    log = tmp_path / "log.csv"
+    rows = np.column_stack([motion.time, motion.motor_angle, motion.load_angle, motion.motor_torque])
+    np.savetxt(log, rows, delimiter=",", header="Time,Position,Position,Torque", comments="")
+    found = fitting.inspect(log)
+    assert all(finding.severity != "refusal" for finding in found.findings[0])
+    (tmp_path / "drive.toml").write_text(fill_in(found.drive_file()), encoding="utf-8")
+    (read,) = fitting.load(log, tmp_path / "drive.toml").logs
+    np.testing.assert_allclose(read.motor_angle, motion.motor_angle, atol=1e-12)
+    np.testing.assert_allclose(read.load_angle, motion.load_angle, atol=1e-12)

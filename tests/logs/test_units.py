@@ -43,6 +43,22 @@ def test_common_units_agree_with_pint(unit: str, registry: pint.UnitRegistry):
         ("5 rad / 100", "rad", 0.05),
         ("mNm", "N m", 1e-3),
         ("10 N cm", "N m", 0.1),
+        ("Degrees", "rad", np.pi / 180.0),
+        ("RPM", "rad/s", np.pi / 30.0),
+        ("min⁻¹", "rad/s", np.pi / 30.0),
+        ("Sec", "s", 1.0),
+        ("MS", "s", 1e-3),
+        ("Deg C", "K", 274.15),
+        ("Amps", "A", 1.0),
+        ("NM", "N m", 1.0),
+        ("Newton-meters", "N m", 1.0),
+        ("N.m", "N m", 1.0),
+        ("Ncm", "N m", 0.01),
+        # Pound and ounce of force: 0.45359237 kg and a sixteenth of it, at 9.80665 m/s^2.
+        ("in-lb", "N m", 0.0254 * 0.45359237 * 9.80665),
+        ("ft lbs", "N m", 0.3048 * 0.45359237 * 9.80665),
+        ("oz-in", "N m", 0.0254 * 0.45359237 / 16 * 9.80665),
+        ("lb in^2", "kg m^2", 0.45359237 * 0.0254**2),
     ],
 )
 def test_number_with_unit_is_converted(text: str, target: str, value: float):
