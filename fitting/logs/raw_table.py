@@ -9,6 +9,12 @@ import numpy as np
 
 from fitting.errors import InputError
 
+DATE = r"(?:[0-9./-]+|[0-9]{1,2}[ ./-][A-Za-z]{3,9}[ ./-][0-9]{2,4}|[A-Za-z]{3,9}\.? [0-9]{1,2}[,.]? [0-9]{4})"
+"""Pattern of a date before a time of day, in numbers or with the name of the month."""
+
+HALF_DAY = r"(?:\s?([AaPp])\.?[Mm]\.?)?"
+"""Pattern of the half of the day behind a time of day."""
+
 
 @dataclass(frozen=True, eq=False)
 class RawColumn:

@@ -9,7 +9,7 @@ from pathlib import Path
 from fitting.errors import InputError
 from fitting.logs.lvm import MAGIC, lvm_table
 from fitting.logs.plain_numbers import plain_columns
-from fitting.logs.raw_table import RawColumn, RawTable, numbered, places_of, split_unit
+from fitting.logs.raw_table import DATE, HALF_DAY, RawColumn, RawTable, numbered, places_of, split_unit
 from fitting.logs.units import USUAL, is_unit
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
@@ -23,7 +23,8 @@ _NUMBER = re.compile(
     r"[-+\u2212]?(?:[0-9][0-9.,'’]*|\.[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE
 )
 _STAMP = re.compile(
-    r"(?:[0-9./-]+[T _]|[0-9]+ days?,? )?[0-9]{1,4}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]*)?(?:Z|UTC|[-+][0-9:]{4,5})?"
+    rf"(?:{DATE}[T _]|[0-9]+ days?,? )?[0-9]{{1,4}}:[0-9]{{2}}(?::[0-9]{{2}})?(?:[.,][0-9]*)?{HALF_DAY}"
+    r"(?:Z|UTC|[-+][0-9:]{4,5})?"
 )
 # A duration, or a number with a blank before its unit: 0.001 sec, 12ms, 3.5 N m.
 _UNITS = "|".join(map(re.escape, sorted((*USUAL, "sec", "msec", "usec", "°", "A", "mA", "V", "mV", "%"), reverse=True)))

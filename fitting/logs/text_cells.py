@@ -5,7 +5,7 @@ from io import BytesIO
 import numpy as np
 import polars as pl
 
-from fitting.logs.raw_table import RawColumn
+from fitting.logs.raw_table import DATE, HALF_DAY, RawColumn
 from fitting.logs.units import UnitError, convert
 
 # Words for missing numbers.
@@ -16,7 +16,7 @@ _MOST_UNITS = 8
 _THOUSANDS = r"^[-+]?[1-9][0-9]{{0,2}}({0}[0-9]{{3}})+$"
 # Largest share of stamps that may be incomplete, assumed.
 _TORN = 0.05
-# With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
+# With dots between day and month, the day is first; slashes are ambiguous.
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
 
 
@@ -135,22 +135,26 @@ def _stamps(cells: pl.Series) -> np.ndarray | None:
     plain = cells.str.replace(",", ".", literal=True).str.replace(r"\s*(Z|UTC|[-+][0-9]{2}:?[0-9]{2})$", "")
     plain = plain.str.replace(r"^([0-9]+):([0-9]{2}\.[0-9]*)$", "0:${1}:${2}")
     parts = plain.str.extract_groups(
-        r"^(?:([0-9]+) days?\.?,?\s+)?(?:([0-9./-]+)[T\s_]+)?([0-9]{1,4}):([0-9]{1,2})(?::([0-9]{1,2}(?:\.[0-9]*)?))?$"
+        rf"^(?:([0-9]+) days?\.?,?\s+)?(?:({DATE})[T\s_]+)?"
+        rf"([0-9]{{1,4}}):([0-9]{{1,2}})(?::([0-9]{{1,2}}(?:\.[0-9]*)?))?{HALF_DAY}$"
     )
     known = parts.struct.field("4").is_not_null()
     if known.sum() < (1.0 - _TORN) * len(cells) or not known.any():
         return None
-    since, date, hour, minute, second = (parts.struct.field(f).filter(known) for f in ("1", "2", "3", "4", "5"))
+    since, date, hour, minute, second, half = (parts.struct.field(f).filter(known) for f in "123456")
     clock = [p.cast(pl.Float64, strict=False).fill_null(0.0).to_numpy() for p in (since, hour, minute, second)]
+    if half.null_count() == 0:
+        clock[1] = clock[1] % 12.0 + 12.0 * (half.str.to_lowercase() == "p").to_numpy()
     seconds = clock[0] * _SECONDS_A_DAY + clock[1] * 3600.0 + clock[2] * 60.0 + clock[3]
-    if date.null_count() == len(date):
-        # The clock restarts at midnight.
-        days = np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY)
-    else:
-        read = (date.str.to_date(form, strict=False) for form in _DATES)
-        days = next((found.cast(pl.Int32).to_numpy() for found in read if found.null_count() == 0), None)
-        if days is None:
+    read = (date.str.to_date(form, strict=False) for form in _DATES)
+    days = next((found.cast(pl.Int32).to_numpy() for found in read if found.null_count() == 0), None)
+    if days is None:
+        # The clock restarts at midnight. Dates in another form only have to change there.
+        midnight = np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY
+        changed = (date != date.shift(1)).fill_null(value=False).to_numpy()
+        if date.null_count() < len(date) and not np.array_equal(changed, midnight):
             return None
+        days = np.cumsum(midnight)
     stamps = np.full(len(cells), np.nan)
     stamps[known.to_numpy()] = seconds + _SECONDS_A_DAY * days
     return stamps

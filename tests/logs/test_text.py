@@ -126,6 +126,10 @@ def test_column_named_with_its_unit_has_that_unit():
         ("21.11.2026 23:59:59.75", "22.11.2026 00:00:00.25"),
         ("23:59:59.75", "00:00:00.25"),
         ("20261121_23:59:59.75", "20261122_00:00:00.25"),
+        ("11/21/2026 11:59:59.75 PM", "11/22/2026 12:00:00.25 AM"),
+        ("21/11/2026 11:59:59.75 AM", "21/11/2026 12:00:00.25 PM"),
+        ("21-Nov-2026 23:59:59.75", "22-Nov-2026 00:00:00.25"),
+        ("Nov 21, 2026 23:59:59.75", "Nov 22, 2026 00:00:00.25"),
     ],
 )
 def test_dates_and_times_of_day_become_seconds(first: str, second: str):
@@ -204,7 +208,7 @@ def test_invalid_row_does_not_discard_the_rows_above():
 
 
 def test_ambiguous_date_is_read_as_text():
-    column = read("time;a\n09/10/2026 10:00:00;1\n09/10/2026 10:00:01;2\n").columns["time"]
+    column = read("time;a\n09/10/2026 10:00:00;1\n10/10/2026 10:00:01;2\n").columns["time"]
     assert len(column.text_rows) == 2
 
 
