@@ -97,7 +97,10 @@ def read_columns(path: Path, source: Any = None) -> Table:
             left_out[name] = reason
             del kept[name]
     if not kept:
-        raise InputError(f"{path}: no column holds numbers; give the log file itself, or export it with its samples")
+        why = f" ({'; '.join(f'{name} {reason}' for name, reason in list(left_out.items())[:3])})" if left_out else ""
+        raise InputError(
+            f"{path}: no column holds numbers{why}; give the log file itself, or export it with its samples"
+        )
     lengths = [len(column.values) for column in kept.values() if column.time is None]
     # Of arrays of several lengths, the most frequent length is used.
     usual = max(lengths, key=lambda n: (lengths.count(n), n), default=0)

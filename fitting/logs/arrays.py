@@ -12,7 +12,7 @@ from fitting.errors import InputError
 from fitting.logs.raw_table import RawColumn, RawTable, not_numbers
 
 # Names of scalar sample rates beside the data in MATLAB and HDF5 files.
-_RATE_NAMES = ("fs", "Fs", "FS", "sample_rate", "sampling_rate")
+_RATE_NAMES = ("fs", "Fs", "FS", "sample_rate", "sampling_rate", "sampling_frequency", "SampleRate")
 _STEP_NAMES = ("Ts", "dt", "sample_time")
 _UNIT_NAMES = ("unit", "units", "Unit", "Units")
 _DEEPEST = 12
@@ -52,33 +52,54 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
     Args:
         path: for messages.
         source: the data to read.
-        wanted: paths such as "run/T", "run/table/T" (a field of a compound dataset) or "run/data(:,3)"; the last part
-            alone where it is unique.
+        wanted: paths such as "run/T", "run/table/T" (a field of a compound dataset), "run/data(:,3)", or of MATLAB's
+            struct arrays and cells "logs(2)/T" and "data(2)"; the last part alone where it is unique.
     """
     import h5py
 
     with h5py.File(source, "r") as file:
         held: dict[str, tuple[Any, str | None]] = {}
+        rates: dict[str, tuple[Any, str | None]] = {}
 
-        def note(name: str, item: object) -> None:
-            # MATLAB v7.3 stores the content of cells under "#refs#".
-            if not isinstance(item, h5py.Dataset) or name.startswith("#"):
+        def note(name: str, item: Any, depth: int = 0) -> None:
+            # MATLAB v7.3 stores what cells and struct arrays refer to under "#refs#".
+            if name.startswith("#") or depth > _DEEPEST:
                 return
-            if item.dtype.names is None:
-                held[name] = (item, None)
-            for field in item.dtype.names or ():
-                held[f"{name}/{field}"] = (item, field)
+            if isinstance(item, h5py.Group):
+                keys = [key for key in (*_RATE_NAMES, *_STEP_NAMES) if key in item.attrs]
+                rates.update({f"{name}/{key}".lstrip("/"): (item.attrs[key], None) for key in keys})
+                if depth:
+                    item.visititems(lambda inner, of: note(f"{name}/{inner}", of, depth))
+            elif h5py.check_ref_dtype(item.dtype) is not None:
+                group, _, leaf = name.rpartition("/")
+                cell = item.attrs.get("MATLAB_class") == b"cell" or not group
+                for i, reference in enumerate(item[()].ravel()):
+                    if reference:
+                        at = f"{name}({i + 1})" if cell else f"{group}({i + 1})/{leaf}"
+                        note(at, file[reference], depth + 1)
+            else:
+                fields = item.dtype.names or (None,)
+                held.update({name if f is None else f"{name}/{f}": (item, f) for f in fields})
 
+        note("", file)
         file.visititems(note)
+        held |= {name: rate for name, rate in rates.items() if name not in held}
 
         def load(name: str) -> Any:
             item, field = held[name]
+            if not isinstance(item, h5py.Dataset):
+                return item
             if item.attrs.get("MATLAB_empty", 0):
                 return np.zeros(0)
+            if "MATLAB_object_decode" in item.attrs:
+                raise not_numbers(path, name, "is a table or object of MATLAB's own", "save its columns as vectors")
+            if item.attrs.get("MATLAB_class") == b"char":
+                raise not_numbers(path, name, "is text")
             return item[()] if field is None else item[field]
 
         def unit(name: str) -> str | None:
-            return _text(next((held[name][0].attrs[a] for a in _UNIT_NAMES if a in held[name][0].attrs), None))
+            attributes = getattr(held[name][0], "attrs", {})
+            return _text(next((attributes[a] for a in _UNIT_NAMES if a in attributes), None))
 
         return _table(path, held, wanted, "/", load, unit)
 
@@ -198,7 +219,8 @@ def _vector(path: Path, name: str, data: Any, column: int | None) -> np.ndarray:
         raise not_numbers(path, name, "is a cell, table or object of MATLAB's own", "store it with double()")
     array = _seconds(np.asarray(data))
     if array.dtype.names is not None or array.dtype.kind not in "biuf":
-        raise not_numbers(path, name, "is a struct, text or complex")
+        kind = "a struct" if array.dtype.names else "text" if array.dtype.kind in "SUO" else "complex"
+        raise not_numbers(path, name, f"is {kind}")
     if column is not None:
         # MATLAB v7.3 keeps its matrices transposed; the long side is time.
         array = array.T if array.ndim == 2 and array.shape[1] > array.shape[0] else array

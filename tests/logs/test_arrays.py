@@ -91,6 +91,30 @@ def test_units_of_hdf5_datasets_are_read(tmp_path: Path):
     assert [found[name].unit for name in "abc"] == ["deg", "N m", None]
 
 
+def test_struct_arrays_and_cells_of_matlab_7_3_are_numbered_from_one(tmp_path: Path):
+    path = tmp_path / "log.mat"
+    with h5py.File(path, "w") as file:
+        held = [file.create_dataset(f"#refs#/{name}", data=np.full((1, 4), float(k))) for k, name in enumerate("abc")]
+        held[2].attrs["MATLAB_object_decode"] = np.int32(3)
+        struct = file.create_group("#refs#/d")
+        struct["x"] = np.full((1, 4), 5.0)
+        references = np.array([[held[0].ref], [held[1].ref]], dtype=h5py.ref_dtype)
+        file.create_dataset("out/signals/values", data=references)
+        cell = file.create_dataset("out/parts", data=np.array([[struct.ref], [held[2].ref]], dtype=h5py.ref_dtype))
+        cell.attrs["MATLAB_class"] = np.bytes_("cell")
+    first, second, inner = values(path, "out/signals(1)/values", "out.signals(2).values", "out/parts(1)/x")
+    assert (first.tolist(), second.tolist(), inner.tolist()) == ([0.0] * 4, [1.0] * 4, [5.0] * 4)
+    with pytest.raises(InputError, match=r"'out/parts\(2\)' is a table or object of MATLAB's own"):
+        values(path, "out/parts(2)")
+
+
+def test_attribute_of_a_group_gives_the_sample_rate(tmp_path: Path):
+    path = hdf5(tmp_path, {"run/a": np.arange(4.0)})
+    with h5py.File(path, "a") as file:
+        file.attrs["sampling_rate"] = 500.0
+    assert read_table(path, ["a"]).sample_rate == 500.0
+
+
 @pytest.mark.parametrize(("name", "value", "rate"), [("fs", 2000.0, 2000.0), ("Ts", 5e-4, 2000.0), ("fs", -1.0, None)])
 def test_scalar_sample_rate_or_step_gives_the_sample_rate(tmp_path: Path, name: str, value: float, rate: float | None):
     for path in (mat(tmp_path, run={"a": A}, **{name: value}), hdf5(tmp_path, {"run/a": A, f"run/{name}": value})):
