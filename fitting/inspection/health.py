@@ -1,6 +1,6 @@
 """Health check of logs with guessed signals, before anything is filled in."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
     except (InputError, DataError) as error:
         return (Finding("refusal", str(error).removeprefix(f"{path}: "), path.name, "`hdjax fit` refuses this"),)
     if ratio is None and log.motor_angle is not None and log.load_angle is not None:
-        return log.findings
+        return (*log.findings, *_constants(inspection, k))
     # Without inertias, findings on them are dropped.
     return examine(log, drive_of({**tables, "drive": known, "signals": signals}, _DRIVE_FILE))
 
@@ -68,8 +68,12 @@ def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:
         values = table.column(guess.column).values
         blank = int((~np.isfinite(values)).sum())
         if blank:
-            what = f"blank in {blank} rows ({100 * blank / len(values):.2g} %)"
+            what = f"blank in {blank} rows ({100 * blank / len(values):.3g} %)"
             found.append(Finding("note", what, guess.column, "they will have weight zero in a fit"))
-        if table.column(guess.column).constant:
-            found.append(Finding("warning", "it is constant", guess.column, "it has no information in this log"))
-    return tuple(found)
+    return (*found, *_constants(inspection, k))
+
+
+def _constants(inspection: Inspection, k: int) -> Iterator[Finding]:
+    for guess in inspection.joint.signals.values():
+        if inspection.tables[k].column(guess.column).constant:
+            yield Finding("warning", "it is constant", guess.column, "it has no information in this log")

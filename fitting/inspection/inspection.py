@@ -199,7 +199,7 @@ def joint_labels(columns: Sequence[Column]) -> tuple[str, ...]:
     """The labels of a robot's joints, from repeated column names; empty for one drive."""
     stems: dict[str, set[str]] = {}
     for column in columns:
-        if column.sense.joint is not None and column.sense.quantities[:1] and column.sense.quantities[0] in _SHARED:
+        if column.sense.joint is not None and set(column.sense.quantities) & set(_SHARED):
             stems.setdefault(column.sense.joint, set()).add(column.sense.stem)
     bare = [c.sense for c in columns if c.sense.joint is None]
     # Two encoders of one drive may also be numbered, but not its torque.

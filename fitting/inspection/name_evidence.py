@@ -47,17 +47,18 @@ def in_context(columns: Sequence[Column]) -> tuple[NameSense, ...]:
     """Meaning of the names, each in context of the others.
 
     In a robot's log `theta` is the motor's angle where `q` is the link's, and so are their rates. In a system's log `u`
-    is the input and `y` the output.
+    is the input and `y` the output: of a joint its torque and angle.
     """
     leaves = [column.sense.stem.rpartition(".")[2] for column in columns]
     robot = any("theta" in leaf for leaf in leaves) and "q" in leaves
-    system = {"u", "y"} <= set(leaves)
+    system = {"u", "y"} <= {leaf.partition("_")[0] for leaf in leaves}
     return tuple(_beside(column.sense, leaf, robot, system) for column, leaf in zip(columns, leaves, strict=True))
 
 
 def _beside(sense: NameSense, leaf: str, robot: bool, system: bool) -> NameSense:
-    if system and leaf in ("u", "y"):
-        return replace(sense, quantities=("input",) if leaf == "u" else ("twist",))
+    if system and sense.quantities[:1] in (("input",), ("twist",)) and leaf.partition("_")[0] in ("u", "y"):
+        of = ("input", "twist") if sense.joint is None else ("torque", "angle")
+        return replace(sense, quantities=of[:1] if leaf.startswith("u") else of[1:])
     if robot and sense.side is None and sense.quantities[:1] in (("angle",), ("velocity",)):
         side = "motor" if "theta" in leaf else "load" if leaf in ("q", "dq", "qd", "q_dot") else None
         return replace(sense, side=side)

@@ -95,17 +95,17 @@ def _table(rows: Sequence[Row]) -> list[str]:
 
 def _rest(inspection: Inspection) -> Iterator[str]:
     shown = {row[0] for row in column_rows(inspection)}
-    rest = [c.name for c in inspection.tables[0].columns if c.name not in shown]
+    rest = [c.name[:60] for c in inspection.tables[0].columns if c.name not in shown]
     if rest:
         yield f"Not used: {_some(rest)}"
-    left_out = [f"{name} ({reason})" for name, reason in inspection.tables[0].left_out.items()]
+    left_out = [f"{name[:60]} ({reason})" for name, reason in inspection.tables[0].left_out.items()]
     if left_out:
         yield f"No channels: {_some(left_out)}"
 
 
 def _some(names: Sequence[str]) -> str:
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f"{', '.join(name[:60] for name in names[:_MOST_NAMES])}{more}"
+    return f"{', '.join(names[:_MOST_NAMES])}{more}"
 
 
 def _joints(inspection: Inspection) -> Iterator[str]:
@@ -140,7 +140,8 @@ def _excitation(inspection: Inspection, moved: Sequence[Excitation]) -> Iterator
         yield f"  {name}{'; '.join(ranges) or 'no signal was recognised'}"
         if one.band is not None and inspection.joint.kind != "quasi-static":
             yield f"  {name}90 % of the power of {one.driver} lies from {one.band[0]:.4g} to {one.band[1]:.4g} Hz"
-            yield f"  {name}{_coherence(one)}"
+            if one.response is not None:
+                yield f"  {name}{_coherence(one)}"
 
 
 def _coherence(one: Excitation) -> str:

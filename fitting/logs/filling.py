@@ -51,7 +51,7 @@ def trusted_rows(
         blank = np.flatnonzero(~known[:until])
         if len(blank):
             seen = "was not sampled" if own_clocks else "is blank or not finite"
-            what = f"{name} {seen} in {len(blank)} rows ({100 * len(blank) / until:.2g} %)"
+            what = f"{name} {seen} in {len(blank)} rows ({100 * len(blank) / until:.3g} %)"
             where = f"{drive_file.column_of(name).column}, first in row {blank[0] + 1}"
             findings.append(
                 Finding("note" if own_clocks else "warning", what, where, "they have weight zero in the fit")
@@ -105,7 +105,7 @@ def interpolated(
                 f"{path}: {_column(drive_file, name)} holds no numbers; name the right column or leave it out"
             )
         if not known.all() and name in OPTIONAL_SIGNALS:
-            what = f"{name} is blank in {(~known).sum()} rows ({100 * np.mean(~known):.2g} %)"
+            what = f"{name} is blank in {(~known).sum()} rows ({100 * np.mean(~known):.3g} %)"
             findings.append(Finding("note", what, name, "it was interpolated between the rows that have it"))
         if not known.all():
             signals[name] = np.interp(time, time[known], signals[name][known])

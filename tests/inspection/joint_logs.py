@@ -368,6 +368,18 @@ SHAPES: dict[str, Shape] = {
         {"u": ("forcing", None, 1), "y": ("dynamic_error", None, 1)},
         ratio=None,
     ),
+    "inputs and outputs of a robot": Shape(
+        lambda s: {
+            "time_train": s.time,
+            **{f"u_train(:,{j})": s.motor_torque if j == 2 else _smooth(j, s.time.size) for j in range(1, 4)},
+            **{f"y_train(:,{j})": _deg(s.motor_angle) if j == 2 else _smooth(-j % 9, s.time.size) for j in range(1, 4)},
+        },
+        {"u_train(:,2)": ("motor_torque", None, 1)},
+        open=("y_train(:,2)",),
+        ratio=None,
+        joint="2",
+        time="time_train",
+    ),
     "nothing that is a drive": Shape(
         lambda s: {f"sensor{k}": _smooth(k, s.time.size) for k in range(4)} | {"humidity": _smooth(7, s.time.size)},
         {},

@@ -72,6 +72,17 @@ def test_log_without_a_time_column_asks_for_the_sample_rate(counter: dict[str, i
     assert set(found.inspection.joint.signals) == {"motor_angle", "load_angle", "motor_torque"}
 
 
+@pytest.mark.parametrize("torque", [0.0, 1.0])
+def test_log_at_rest_is_told(torque: float, drive_log: dict[str, np.ndarray]):
+    still = {k: v if k == "time" else 0.0 * v + torque for k, v in drive_log.items()}
+    found = fitting.inspect(still)
+    assert {f.where for f in found.findings[0] if f.what == "it is constant"} == set(drive_log) - {"time"}
+
+
+def test_log_without_an_angle_tells_no_coherence(drive_log: dict[str, np.ndarray]):
+    assert "None" not in fitting.inspect({k: drive_log[k] for k in ("time", "motor_torque")}).summary()
+
+
 def test_repeated_time_column_is_the_clock_of_the_next_column(motion: Motion):
     late = motion.time + 3e-4
     columns = {
