@@ -17,7 +17,8 @@ _LOOKED_AT = 400
 _LETTER = re.compile(r"[^\W\d_]")
 # Most lines above the table; a file whose numbers begin later is not a log.
 _PREAMBLE = 2000
-_LINES_ABOVE = 4
+# Most lines with words between a header and the numbers, as in exports that list properties of each channel.
+_LINES_ABOVE = 24
 _MOST_LEFT_OUT = 3
 _NUMBER = re.compile(
     r"[-+\u2212]?(?:[0-9][0-9.,'’]*|\.[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE
@@ -134,8 +135,8 @@ def _decode(path: Path, raw: bytes) -> str:
     head = raw[:4096]
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = raw.decode("utf-16", errors="replace")
-    elif len(head) > 8 and head[1::2].count(0) > 0.4 * len(head[1::2]) and head[::2].count(0) == 0:
-        text = raw.decode("utf-16-le", errors="replace")
+    elif len(head) > 8 and head.count(0) > 0.2 * len(head) and 0 in (head[::2].count(0), head[1::2].count(0)):
+        text = raw.decode("utf-16-be" if head[::2].count(0) else "utf-16-le", errors="replace")
     else:
         try:
             text = raw.decode("utf-8-sig")
@@ -238,8 +239,8 @@ def _header(
     # The first cell may be the row's own title.
     units = [cell.strip("[]()") for cell in rows[-1][1]] if has_units else []
     units = ["" if re.fullmatch("(?:unit|einheit)[a-z]*:?", cell, re.IGNORECASE) else cell for cell in units]
-    # A corrupt row of samples may be a word and blanks.
-    index, names = max(reversed(rows[:-1] if has_units else rows), key=lambda row: sum(map(bool, row[1])))
+    # A corrupt row of samples may be a word and blanks; a row of properties repeats its title.
+    index, names = max(reversed(rows[:-1] if has_units else rows), key=lambda row: len({*row[1]} - {""}))
     behind = range((rows[-1][0] if has_units else index) + 1, dialect.first)
     rows_begin = (i for i in behind if not _LETTER.search(lines[i]) or _row(lines[i], dialect.delimiter)[1] > 0)
     first = next(rows_begin, dialect.first)

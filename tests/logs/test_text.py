@@ -48,6 +48,7 @@ DIALECTS: dict[str, str | bytes] = {
     "BOM": table(",").encode("utf-8-sig"),
     "UTF-16": table(";", decimal=",").encode("utf-16"),
     "UTF-16 without BOM": table(",").encode("utf-16-le"),
+    "UTF-16 without BOM, high bytes first": table(",").encode("utf-16-be"),
     "Latin-1": table(",", head="# Prüfstand, 20 °C\n").encode("latin-1"),
     "comments": table(",", head="# rig\n# second line, with comma\n\n"),
     "preamble": table(";", head="Export of rig 7\nDate;21.11.2026 10:00\nOperator: N. N.\n\nRate;2 kHz\n"),
@@ -299,3 +300,12 @@ def test_plain_number_reader_agrees_with_the_general_reader(text: str, delimiter
 @pytest.mark.parametrize(("text", "delimiter"), OTHER.values(), ids=OTHER.keys())
 def test_plain_number_reader_declines_other_spellings(text: str, delimiter: str):
     assert plain_columns(text.splitlines(), delimiter, [0, 1]) is None
+
+
+def test_names_above_properties_of_each_channel_are_those_of_the_columns():
+    head = "Name;Axis 1.Pos;Name;Axis 1.Torque\nSymbolComment;;SymbolComment;\nData-Type;REAL64;Data-Type;REAL64\n"
+    head += "SampleTime[ms];1;SampleTime[ms];1\nOffset;0;Offset;0\nBitMask;0x0;BitMask;0x0\nUnit;(None);Unit;(None)\n\n"
+    found = read(head + "0,0;1,5;0,0;-0,1\n1,0;2,5;1,0;-0,2\n2,0;3,5;2,0;-0,3\n", wanted=("Axis 1.Torque", "Name"))
+    assert found.names == ("Name", "Axis 1.Pos", "Name (2)", "Axis 1.Torque")
+    np.testing.assert_array_equal(found.columns["Axis 1.Torque"].values, [-0.1, -0.2, -0.3])
+    np.testing.assert_array_equal(found.columns["Name"].values, [0.0, 1.0, 2.0])
