@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fitting.errors import InputError
+from fitting.logs.channels import without_fill_values
 from fitting.logs.column_names import NameSense, sense
 from fitting.logs.raw_table import RawColumn, RawTable, split_unit
 from fitting.logs.read_table import read_table
@@ -15,7 +16,6 @@ from fitting.logs.read_table import read_table
 _FEWEST_ROWS = 8
 _MOST_TEXT = 0.05  # largest share of rows with text or blanks for a channel
 _MOST_IN_A_MATRIX = 64
-_FILL = 1e30  # larger values are fill values
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def _no_channel(column: RawColumn) -> str | None:
 def _column(name: str, raw: RawColumn, plain: Sequence[str]) -> Column:
     said = sense(name)
     short = split_unit(name)[0]
-    values = np.where(np.abs(raw.values) < _FILL, raw.values, np.nan)
+    values, _ = without_fill_values(raw.values)
     return Column(
         name=short if plain.count(short) == 1 else name,
         unit=_plain_unit(raw.unit or said.unit),

@@ -27,6 +27,7 @@ SI = {
 }
 _UNSTATED = {"dynamic_error": "rad", "forcing": "rad/s^2"}
 _FILL = 1e30  # larger values are fill values, as in NetCDF
+_NINES = tuple(sign * (10.0**digits - 1.0) for digits in range(3, 8) for sign in (-1, 1))
 _MOST_TEXT = 0.05
 
 
@@ -60,7 +61,12 @@ def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *
     """
     place = drive_file.column_of(signal)
     findings = [*_text(path, place.column, column, first_row)]
-    values = np.where(np.abs(column.values) < _FILL, column.values, np.nan)
+    values, filled = without_fill_values(column.values)
+    if filled is not None:
+        rows = np.flatnonzero(column.values == filled)
+        where = f"{place.column}, first in data row {first_row + rows[0] + 1}"
+        what = f"{len(rows)} cells hold the fill value {filled:.10g}"
+        findings.append(Finding("warning", what, where, "they count as blank"))
     unit, disagreement = _unit(place, column, signal)
     findings += disagreement
     values, wrapped = _unwrapped(drive_file, signal, place, values, unit, first_row)
@@ -68,6 +74,20 @@ def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *
     # The conversion may overflow or underflow.
     converted = np.where(np.abs(converted) < _FILL, converted, np.nan)
     return Channel(converted, name, (*findings, *wrapped))
+
+
+def without_fill_values(values: np.ndarray) -> tuple[np.ndarray, float | None]:
+    """The values, NaN for fill values; and the fill value of nines, or None.
+
+    All beyond 1e30 are fill values, and so is a number of nines, such as -999, that is farther from all others than
+    these are apart.
+    """
+    values = np.where(np.abs(values) < _FILL, values, np.nan)
+    for level in np.intersect1d(values, _NINES):
+        others = values[np.isfinite(values) & (values != level)]
+        if len(others) and 0 < np.ptp(others) < np.min(np.abs(others - level)):
+            return np.where(values == level, np.nan, values), float(level)
+    return values, None
 
 
 def _text(path: Path, name: str, column: RawColumn, first_row: int) -> Sequence[Finding]:

@@ -7,6 +7,7 @@ import pytest
 from log_files import ROWS, drive_table, one_sentence, read_drive, save, save_text
 
 from fitting.errors import DataError, InputError
+from fitting.logs.channels import without_fill_values
 from fitting.logs.log import read_log
 
 
@@ -23,6 +24,22 @@ def test_blank_outputs_are_masked_and_counted(tmp_path: Path, kind: str, value: 
     first, second = log.findings
     assert "motor_angle is blank or not finite in 2 rows" in first.what and "row 17" in first.where
     assert first.severity == "warning" and "row 100" in second.where
+
+
+@pytest.mark.parametrize("fill", [-999.0, 9999.0])
+def test_fill_values_of_nines_count_as_blank(tmp_path: Path, fill: float) -> None:
+    table = drive_table()
+    table["load_angle"][[99, *range(300, 340)]] = fill
+    log = read_log(save(tmp_path, table), read_drive(tmp_path))
+    assert log.trusted is not None
+    np.testing.assert_array_equal(np.flatnonzero(~log.trusted), [99, *range(300, 340)])
+    assert f"41 cells hold the fill value {fill:g}" in log.findings[0].what and "row 100" in log.findings[0].where
+
+
+@pytest.mark.parametrize("values", [np.linspace(0.0, 1998.0, 1999), np.array([0.0, 999.0] * 9)])
+def test_value_of_nines_among_others_is_kept(values: np.ndarray) -> None:
+    assert 999.0 in values
+    np.testing.assert_array_equal(without_fill_values(values)[0], values)
 
 
 @pytest.mark.parametrize("kind", ["csv", "hdf5"])
