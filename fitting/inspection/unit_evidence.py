@@ -18,6 +18,7 @@ _COUNTS = 1.0  # that integers are counts
 _WHOLE_ANGLE = -5.0  # that integers are radians or degrees
 _GRID = 4.0
 _WRAP = 6.0
+_WORDS = (2.0**16, 2.0**32)  # counters of so many wrap at any angle
 _GRID_TOLERANCE = 2e-3  # of a bit
 _MOST_BITS = 26
 # Largest angle and speed of a shaft in a log, in radians and radians per second; assumed.
@@ -116,7 +117,7 @@ def _given_away(column: Column) -> dict[str, tuple[float, str]]:
             found[unit] = (_WRAP, f"wraps at {revolution:.5g}")
         elif len(rows) and span == 2.0 ** round(np.log2(span)):
             unit = f"rev / {int(span)}"
-            found[unit] = (_WRAP, f"wraps at {int(span)}")
+            found[unit] = (_COUNTS if span in _WORDS else _WRAP, f"wraps at {int(span)}")
         if found:
             return found
     step = _grid(values)

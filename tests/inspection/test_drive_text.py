@@ -126,3 +126,10 @@ def test_log_with_columns_of_one_name_is_read_with_its_drive_file(motion: Motion
     (read,) = fitting.load(log, tmp_path / "drive.toml").logs
     np.testing.assert_allclose(read.motor_angle, motion.motor_angle, atol=1e-12)
     np.testing.assert_allclose(read.load_angle, motion.load_angle, atol=1e-12)
+
+
+def test_counter_that_wraps_at_16_bits_does_not_tell_its_revolution(motion: Motion):
+    counts = np.mod(np.rint(motion.motor_angle * 4096 / (2 * np.pi)) + 7000, 65536)
+    columns = {"t": motion.time, "motor_enc": counts, "load_angle": motion.load_angle, "tau": motion.motor_torque}
+    found = fitting.inspect(columns)
+    assert found.inspection.joint.signals["motor_angle"].unit in (None, "rev / 4096")
