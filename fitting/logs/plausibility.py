@@ -160,13 +160,14 @@ def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     deviation = abs(slope * ratio - 1)
     span = max(float(np.ptp(load)), float(np.ptp(motor)) / ratio)
     neighbour = round(says) != ratio and abs(says - round(says)) < 0.02
-    drifts = neighbour and deviation * span > FREE_MOTION
+    drifts = neighbour and deviation * span > LARGE_TWIST
     if deviation <= RATIO_TOLERANCE and not drifts:
         return
     mend = _mend(says, ratio, motor_name, load_name)
+    possible = LARGE_TWIST if deviation > RATIO_TOLERANCE else FREE_MOTION
     if span <= FREE_MOTION:
         severity, consequence = "warning", f"unless it was locked, {mend}"
-    elif deviation * span <= (drive_file.largest_twist or LARGE_TWIST):
+    elif deviation * span <= (drive_file.largest_twist or possible):
         severity, consequence = "warning", f"unless slow torque twists the gear by {deviation * span:.2g} rad, {mend}"
     else:
         soft = "if its spring is so soft, state the largest_twist of the joint in [drive]"
