@@ -67,8 +67,9 @@ class SignalGuess:
 
     def in_si(self, values: np.ndarray) -> np.ndarray:
         """Values of the column in SI, without the sign; as logged in a unit of another quantity."""
-        known = self.unit is not None and self.signal in SI and self.is_read
-        return convert(values, self.unit, SI[self.signal]) if known else self.size * values
+        if self.unit is None or self.signal not in SI or not self.is_read:
+            return self.size * values
+        return convert(values, self.unit, SI[self.signal])
 
     @property
     def why(self) -> str:
