@@ -47,7 +47,7 @@ class ParameterInfo:
     @property
     def positive(self) -> bool:
         """Whether only positive values are physical."""
-        return self.bounds[0] == 0.0
+        return self.bounds[0] >= 0.0
 
 
 def as_scalar(value: Any) -> Array:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax import Drive, TwoInertiaModel
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 
@@ -81,3 +82,11 @@ def test_third_inertia_reports_its_derived_parameters():
     effect = model(1e-2, 4000.0, 0.1)
     found = {name: float(v) for name, (v, _) in effect.effects[0].derived(effect.drive).items()}
     assert found == pytest.approx({"J_3": 1e-2, "K_3": 4000.0, "B_3": 0.1, "zero": np.sqrt(4e5) / (2 * np.pi)})
+
+
+@pytest.mark.parametrize(("zeta", "ended"), [(1e-20, ["extra_resonance.zeta"]), (1e-2, [])])
+def test_undamped_third_inertia_has_ended_at_a_bound(zeta, ended):
+    """A free motion without damping that begins anew in each segment imitates a line."""
+    J_3, omega = 0.1 * J_L, 200.0
+    undamped = model(J_3, J_3 * omega**2, 2 * zeta * omega * J_3)
+    assert parameters_at_bounds(undamped, "extra_resonance") == ended
