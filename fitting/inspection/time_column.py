@@ -28,7 +28,7 @@ _DATED = (
     ("the year 0", {"d": 86400.0}, 719529 * 86400.0),
 )
 _EPOCHS = (0.9e9, 2.5e9)  # s since 1970, of the years 1998 to 2049
-_SLOWEST = 60.0  # s between samples
+_SLOWEST = 60.0  # s between samples, assumed: a drive moves faster
 _MOST_BACK = 0.01
 
 

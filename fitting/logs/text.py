@@ -17,7 +17,7 @@ _LOOKED_AT = 400
 _LETTER = re.compile(r"[^\W\d_]")
 # Most lines above the table; a file whose numbers begin later is not a log.
 _PREAMBLE = 2000
-# Most lines with words between a header and the numbers, as in exports that list properties of each channel.
+# Most lines with words between a header and the numbers, as in exports that list properties of each channel; assumed.
 _LINES_ABOVE = 24
 _MOST_LEFT_OUT = 3
 _NUMBER = re.compile(

@@ -74,27 +74,26 @@ def say_what_intervals_hold(report: dict[str, Any]) -> None:
     """
     unexplained = report["decision"] == "unexplained"
     times_noise, beyond = report["times_noise"], report["free_runs_times_expected"]
-    left = "The model discrepancy is not explained"
-    much = True
+    left = None
     if times_noise >= RULES.excess:
         left = f"The model's residual is {formatting.number(times_noise)} times the noise"
     elif beyond is not None and beyond > RULES.surprise:
         left = f"Free runs err by {formatting.number(beyond)} times what noise and uncertainty allow"
-    else:
-        much = False
     learned = report.get("unknown") or {}
     names = formatting.words(list(report["before"]["parameters"]))
     if (learned.get("place"), learned.get("quantity"), report["parameters_from"]) == ("mesh", "torque", "torque"):
         note = f"A learned torque acts beside {names} in the mesh: they are not unique, their intervals withheld."
         _mark(report["after"], note, withheld=True)
-    if not (unexplained or much):
+    if not (unexplained or left):
         return
-    end = "their intervals are withheld" if unexplained and much else "their intervals do not include that"
+    withheld = unexplained and left is not None
+    left = left or "The model discrepancy is not explained"
+    end = "their intervals are withheld" if withheld else "their intervals do not include that"
     note = f"{left}: {names} may be off by more than their standard errors, and {end}."
     # One side's own equation leaves no more than noise.
     ends = ("before", "after") if report["parameters_from"] == "torque" else ("before",)
     for account in (report[end] for end in ends):
-        _mark(account, note, withheld=unexplained and much)
+        _mark(account, note, withheld=withheld)
 
 
 def _mark(account: dict[str, Any], note: str, *, withheld: bool) -> None:
