@@ -120,6 +120,7 @@ class _Closed:
             dropped=found.dropped,
             doubted=tuple(e.name for e in found.named.model.effects if e.name not in trusted),
             unknown=end.unknown,
+            tied=self.challenge.tied if end.outcome == "effect_found" and end.unknown is None else None,
             case=case,
             evidence=seen,
             noise=end.noise,

@@ -114,6 +114,7 @@ class Loop(eqx.Module):
         dropped: accepted effects that a later one made superfluous.
         doubted: effects that a learned torque contradicts.
         unknown: learned term, where the catalogue does not explain all that is missing.
+        tied: another one, which explains the selection data as well as the found effects.
         case: evidence for the decision.
         evidence: contribution of each effect of the final model, and its estimate from the data.
         noise: covariance of the measurement noise of the outputs.
@@ -148,6 +149,7 @@ class Loop(eqx.Module):
     dropped: tuple[str, ...] = eqx.field(static=True)
     doubted: tuple[str, ...] = eqx.field(static=True)
     unknown: Unknown | None
+    tied: Unknown | None
     case: CaseEvidence = eqx.field(static=True)
     evidence: tuple[Evidence, ...]
     noise: Float[Array, "outputs outputs"]

@@ -214,7 +214,7 @@ def test_learned_term_replaces_an_effect_that_does_not_explain_free_runs(monkeyp
 
     def unchallenged(base, named, *args, **options):
         seen = model_evidence(named, options["noise"])
-        return Challenge(named, None, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
+        return Challenge(named, None, None, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
 
     monkeypatch.setattr(loop_module, "challenge_names", unchallenged)
     experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)

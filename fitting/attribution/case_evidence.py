@@ -136,6 +136,7 @@ class ChallengeEvidence:
         left: noise evidence of the named model; None where its residual is white measurement noise.
         longer_worse: log of the rms error of free runs with the replacing term, over that with the named effects; zero
             where free runs are inconclusive.
+        behind: score of the accepted named effects alone minus that of the replacing term, block by block.
     """
 
     base: ModelEvidence
@@ -151,6 +152,7 @@ class ChallengeEvidence:
     one_shape: bool = False
     left: NoiseEvidence | None = None
     longer_worse: float = 0.0
+    behind: tuple[float, ...] = ()
 
     @property
     def enough(self) -> bool:
@@ -226,6 +228,7 @@ def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
     challenge = stored["challenge"]
     known: dict[str, Any] = _as_found(challenge)
     known["asked"] = tuple(challenge["asked"])
+    known["behind"] = tuple(challenge.get("behind", ()))
     for name in ("base", "named", "beside", "instead"):
         known[name] = None if challenge[name] is None else _model(challenge[name])
     left = challenge["left"]

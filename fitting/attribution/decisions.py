@@ -200,6 +200,19 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
     )
 
 
+def unknown_ties(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
+    """Whether a learned term that differs from the accepted names is tied with them: the check holds then.
+
+    Args:
+        seen: the evidence.
+        rules: the thresholds.
+    """
+    if seen.instead is None or not seen.behind or seen.come_out >= rules.come_out:
+        return ()
+    lost = seen.instead.selection - seen.named.selection
+    return (tie("a learned term in place of the names", np.array(seen.behind), lost, rules),)
+
+
 def _leaves_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
     """Whether a term that left only noise would gain little over the names."""
     return seen.named.selection - seen.noise < rules.little * (seen.base.selection - seen.noise)
@@ -300,7 +313,7 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
     names = evidence.final.names
     if evidence.challenge.names:
         stand = names_stand(evidence.challenge, rules)
-        checks += stand
+        checks += (*stand, *unknown_ties(evidence.challenge, rules))
         if any(check.holds for check in stand) != bool(names):
             lacking.append("the final model with other names")
     outcome, last_checks = conclude(replace(evidence.final, noise_explains=explains), rules)

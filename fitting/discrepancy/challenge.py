@@ -8,9 +8,10 @@ import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, long_errors
 from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
-from fitting.attribution.decisions import names_stand, next_question
+from fitting.attribution.decisions import names_stand, next_question, unknown_ties
 from fitting.attribution.effect_search import refitted_without
 from fitting.attribution.rules import RULES
+from fitting.attribution.score import block_scores
 from fitting.attribution.study import Study
 from fitting.attribution.support import (
     Standing,
@@ -33,12 +34,14 @@ class Challenge(eqx.Module):
         trusted: the model with the accepted names.
         unknown: the term learned beside them, or in place of all.
         left: noise of sensors and torque, where that explains the named model's residual.
+        tied: a learned term that differs from the accepted names and explains the selection data as well.
         seen: evidence for the decision.
     """
 
     trusted: Trial
     unknown: Unknown | None
     left: NoiseModel | None
+    tied: Unknown | None
     seen: ChallengeEvidence = eqx.field(static=True)
 
 
@@ -85,7 +88,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
     left = left if beside is None and is_noise(left) else None
     if named is base:
-        return Challenge(base, beside, left, seen)
+        return Challenge(base, beside, left, None, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
         errors = long_errors([rival, instead.trial], study)
@@ -100,8 +103,14 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
             one_shape=(one.form, one.variables) == (other.form, other.variables)
             and any(other.variables == (e.one_shape_of,) for e in named.model.effects),
         )
-    stand = any(check.holds for check in names_stand(seen))
-    return Challenge(named, beside, left, seen) if stand else Challenge(base, instead, None, seen)
+    if not any(check.holds for check in names_stand(seen)):
+        return Challenge(base, instead, None, None, seen)
+    if instead is not None and beside is None:
+        whitening = np.asarray(instead.trial.held_out.problem.whitening)
+        behind = block_scores(named, whitening) - block_scores(instead.trial, whitening)
+        seen = replace(seen, behind=tuple(map(float, behind)))
+    tied = any(check.holds for check in unknown_ties(seen))
+    return Challenge(named, beside, left, instead if tied else None, seen)
 
 
 def _learned(standing: Standing, study: Study) -> Unknown | None:

@@ -8,6 +8,7 @@ import numpy as np
 from fitting import formatting
 from fitting.next_experiment.proposal import NextExperiment, Precision, Separation, is_decided
 from fitting.report.limits import in_words_of_log
+from hdjax.effects.learned import FAMILY
 
 COMMAND_FILE = "next_experiment.csv"
 """File of the command."""
@@ -85,7 +86,7 @@ def next_lines(report: Mapping[str, Any]) -> list[str]:
         return [] if known else ["--next-experiment searches for a command that determines alpha."]
     # A search tells names from each other, not a learned term.
     named = report["decision"] == "effect_found" and not report["unknown"]
-    tie = named and any(not other["separable"] for other in report["alternatives"])
+    tie = named and any(not a["separable"] and a["family"] != FAMILY for a in report["alternatives"])
     return ["--next-experiment searches for a command that separates the tied explanations."] if tie else []
 
 

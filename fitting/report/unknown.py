@@ -8,14 +8,16 @@ import numpy as np
 from fitting import formatting
 from fitting.discrepancy.closed_forms import Shape, shapes
 from fitting.discrepancy.curve import PLACES, WORDS, LearnedCurve, learned_curve
+from fitting.discrepancy.dynamic_laws import MemoryCandidate
 from fitting.discrepancy.dynamic_stiffness import LearnedResponse, learned_response
+from fitting.discrepancy.learn import Unknown
 from fitting.estimation.free_parameters import effect_paths
 from fitting.first_order.motion import place_of
 from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from hdjax import ReducedModel
-from hdjax.effects.learned import Learned
+from hdjax.effects.learned import Learned, LearnedPeriodic
 from hdjax.effects.learned_axes import UNITS
 from hdjax.effects.learned_memory import Lagging, LaggingShaftTorque, LearnedMemory, Yielding
 
@@ -97,9 +99,7 @@ def _of_function(loop: Loop) -> dict[str, Any]:
 
 def _of_memory(effect: LearnedMemory, loop: Loop) -> dict[str, Any]:
     """Content on a torque with memory."""
-    form = place_of(effect)
-    assert form is not None
-    place, memory = PLACES[form.name], "lags" if isinstance(effect, Lagging) else "yields"
+    place, memory = _place(effect), _memory(effect)
     where = place_and_variables(place, [effect.angle], None, memory)
     said = [f"A learned {where}, represents what is missing. It depends on the past: it has memory."]
     family = _remembers(effect, place)
@@ -154,6 +154,26 @@ def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
     if not isinstance(loop.after.model, ReducedModel):
         return unit
     return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"])
+
+
+def learned_in_words(unknown: Unknown) -> str:
+    """Place and variables of a learned term."""
+    effect = unknown.trial.model.effect(unknown.chosen.form.name)
+    if isinstance(effect, LearnedMemory):
+        return place_and_variables(_place(effect), [effect.angle], None, _memory(effect))
+    assert not isinstance(unknown.chosen, MemoryCandidate)
+    period = 2 * np.pi / float(effect.omega) if isinstance(effect, LearnedPeriodic) else None
+    return place_and_variables(PLACES[effect.name], list(unknown.chosen.variables), period, None)
+
+
+def _place(effect: LearnedMemory) -> str:
+    form = place_of(effect)
+    assert form is not None
+    return PLACES[form.name]
+
+
+def _memory(effect: LearnedMemory) -> str:
+    return "lags" if isinstance(effect, Lagging) else "yields"
 
 
 def place_and_variables(place: str, variables: list[str], period: float | None, memory: str | None) -> str:

@@ -10,7 +10,7 @@ import pytest
 import rig
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
-from fitting.attribution.decisions import names_stand, next_question
+from fitting.attribution.decisions import names_stand, next_question, unknown_ties
 from fitting.attribution.effect_search import base_trial
 from fitting.attribution.study import Setting, Study
 from fitting.discrepancy import challenge as module
@@ -237,3 +237,21 @@ def test_learned_term_is_dropped_where_named_effects_reach_its_error(
     assert module._without_learned(base, named, beside, study) is (alone if superfluous else None)
     assert asked == [{LEARNED.name}]
     assert module._without_learned(base, replace(named, model=base.model), beside, study) is None
+
+
+@pytest.mark.parametrize(
+    ("come_out", "worse", "tied"),
+    [
+        (0.2, 0.0, True),
+        # The learned term is the named law.
+        (0.9, 0.0, False),
+        # It predicts every block worse.
+        (0.2, 3.0, False),
+    ],
+)
+def test_a_learned_term_that_differs_from_the_names_may_be_tied_with_them(come_out: float, worse: float, tied: bool):
+    scatter = np.random.default_rng(1).normal(size=40)
+    behind = tuple(scatter - scatter.mean() + worse)
+    seen = challenge_evidence(-0.1, beside=False, fewer=0, come_out=come_out, behind=behind)
+    assert any(check.holds for check in unknown_ties(seen)) == tied
+    assert unknown_ties(replace(seen, behind=())) == ()

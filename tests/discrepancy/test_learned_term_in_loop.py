@@ -1,5 +1,6 @@
 """The loop with a learned term: its decision, its report, and a named effect beside the term."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.selection_round import Verdict
 from fitting.estimation.free_run import free_run
 from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.report import Report, report_dict
+from fitting.report.alternatives import alternatives
 from fitting.search_options import SearchOptions
 from fitting.stored_model import read_model
 from hdjax import Model
@@ -89,6 +92,20 @@ def test_true_named_effect_stands_beside_a_learned_term(tmp_path: Path):
     assert report["unexplained"] is None and report["unknown"]["variables"] == ["x"]
     assert "What the learned torque looks like" in paths["report.html"].read_text()
     assert eqx.tree_equal(read_model(paths["model.json"]).model, loop.after.model, rtol=1e-12)
+
+
+def test_tied_learned_term_is_told_in_words(loop: Loop):
+    """A name that was found, and the learned term as its tie."""
+    assert loop.unknown is not None
+    friction = Verdict("coulomb_friction", "coulomb_friction", loop.unknown.trial, 1.0, 0.001, separable=True)
+    first = dataclasses.replace(loop.rounds[0], verdicts=(friction,), accepted=True)
+    finding = dataclasses.replace(loop.findings[0], name=friction.name, family=friction.family)
+    changed = {"tied": loop.unknown, "unknown": None, "compared": (first,), "findings": (finding,)}
+    (tie,) = alternatives(Loop(**(vars(loop) | changed)))
+    assert (tie["family"], tie["instead_of"], tie["separable"]) == ("unknown", "coulomb_friction", False)
+    assert tie["name"].startswith("learned torque in the mesh, a function of the") and "twist rate" in tie["name"]
+    assert tie["selection_rmse"] == tie["selection_rmse_of_found"]
+    assert "ring down" in tie["separating_experiment"]
 
 
 def test_report_without_a_learned_term_has_none(loop: Loop):
