@@ -7,9 +7,10 @@ from pathlib import Path
 
 import hypothesis
 import jax
+import jaxtyping
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from jaxtyping import install_import_hook
+from shape_checks import checked
 
 # Tests spend more time on compilation than on computation. XLA reads this when the first program is compiled, also in
 # processes that tests start. A user's command compiles with more optimisation, see `jit_small`.
@@ -42,7 +43,10 @@ SHARED = ROOT.parent / "shared"
 _SHAPED = [
     f for package in ("hdjax", "fitting") for f in (ROOT / package).rglob("*.py") if "jaxtyping" in f.read_text()
 ]
-install_import_hook([".".join(f.relative_to(ROOT).with_suffix("").parts) for f in _SHAPED], "beartype.beartype")
+jaxtyping.jaxtyped = checked  # which the hook puts at each function and class
+jaxtyping.install_import_hook(
+    [".".join(f.relative_to(ROOT).with_suffix("").parts) for f in _SHAPED], "beartype.beartype"
+)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ iteration; this file tells it how to solve for a step.
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +37,7 @@ LATEST = 6
 _CLOSED, _DEAREST = 0.25, 1.5
 
 
-class Chains(eqx.Module):
+class Chains(Record):
     """What closing the gaps makes of each segment's initial state: `by_parameter dp + by_first dc + closing`, where
     dc is the change of the state that its chain starts from.
 
@@ -247,7 +246,7 @@ def _cholesky(matrix: np.ndarray) -> np.ndarray:
         return np.stack([_cholesky(m) for m in matrix]) if matrix.ndim > 2 else np.full(matrix.shape, np.nan)
 
 
-class Iteration(eqx.Module):
+class Iteration(Record):
     """What [`ArrowLevenbergMarquardt`][] carries from step to step.
 
     Attributes:
@@ -313,6 +312,8 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     rtol: float = 1e-3
     atol: float = 0.0
     norm: Callable[[Any], Array] = optx.max_norm
+
+    __getattribute__ = object.__getattribute__  # as of a `Record`
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iteration:
         # By numpy: outside programs of JAX nothing is compiled for it.

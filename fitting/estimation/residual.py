@@ -63,7 +63,7 @@ class Problem(eqx.Module):
     engine: Engine | None = eqx.field(static=True, default=None)
 
 
-class Unknowns(eqx.Module):
+class Unknowns(Record):
     """Unknowns of a fit: the free parameters, and the initial state of each segment."""
 
     parameters: Float[Array | np.ndarray, " parameters"]
