@@ -97,7 +97,8 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
         # Bands are of first order: chaotic motion exceeds them, though short segments leave only noise.
         much = explained is None or explained >= RULES.free_run_explained
         if not (much and challenge.seen.enough):
-            seen = replace(seen, surprise=surprise(fitted, runs, current.held_out, **known))
+            ratio = surprise(fitted, runs, current.held_out, **known)
+            seen = replace(seen, surprise=ratio, wide_bands=ratio is None)
         outcome, _ = conclude(seen)
         if outcome == "unexplained":
             # A learned term that follows long stretches may replace names that do not.

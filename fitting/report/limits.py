@@ -5,6 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.report.outcome import Outcome
+from fitting.report.outputs import in_words
 from fitting.report.separating import plain_family
 from fitting.report.steps import beyond_prediction
 from fitting.uncertainty.identifiability import Identifiability
@@ -96,10 +97,22 @@ def limits(report: Mapping[str, Any]) -> list[str]:
             if report["decision"] != "fit_only"
             else "The logs are too short to reserve test data: the errors are those of the fitted data."
         )
+    notes += _of_wide_bands(report)
     drifting = beyond_prediction(report, final["rmse"]["selection"])
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _of_wide_bands(report: Mapping[str, Any]) -> list[str]:
+    """A note where prediction bands say nothing of free runs."""
+    if not ((report["evidence"] or {}).get("final") or {}).get("wide_bands"):
+        return []
+    output = in_words(report["output"])
+    return [
+        f"Whether free runs err by more than noise and uncertainty allow can't be told: their prediction bands are "
+        f"wider than the measured {output} itself."
+    ]
 
 
 def _of_scale(report: Mapping[str, Any]) -> list[str]:

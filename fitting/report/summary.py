@@ -77,7 +77,7 @@ def _decision(report: Mapping[str, Any]) -> str:
         return f"{opening} {_change(f'Together with a {learned} it' if families else f'A {learned}', report)}"
     if report["evidence"]["final"]["at_bounds"]:
         return f"{opening} A parameter of what was found has ended at a bound: its law does not fit."
-    if report["free_runs_times_expected"] is not None:
+    if report["evidence"]["final"]["surprise"] is not None:
         return f"{opening} Short segments hardly show it: free runs along selection data {_free_runs(report)}."
     depends = f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)"
     if left["explained_share"] < _NO_SHARE:

@@ -1,6 +1,7 @@
 """Sentences, units and rounded numbers in reports."""
 
 import math
+import sys
 from typing import Any, Literal
 
 import numpy as np
@@ -154,6 +155,7 @@ def _report_with_errors(
         ("effect_found", 1.1, None, False, False),
         ("effect_found", 2.7, 1.0, False, True),
         ("effect_found", 1.1, 4.0, False, True),
+        ("effect_found", 1.1, sys.float_info.max, False, True),
         ("unexplained", 44.0, None, True, True),
         ("unexplained", 1.1, None, False, True),
     ],
@@ -173,7 +175,9 @@ def _uncertain_report(
     decision: str, unknown: dict[str, str] | None, times_noise: float, beyond: float | None = None
 ) -> dict[str, Any]:
     accounts = {"before": _account(), "after": _account()}
-    known = {"times_noise": times_noise, "free_runs_times_expected": beyond}
+    # Infinity, which the evidence keeps as the largest number.
+    told = None if beyond == sys.float_info.max else beyond
+    known = {"times_noise": times_noise, "free_runs_times_expected": told, "evidence": {"final": {"surprise": beyond}}}
     return {"decision": decision, "unknown": unknown, "parameters_from": "torque"} | known | accounts
 
 
