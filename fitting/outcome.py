@@ -33,7 +33,7 @@ class Finding(eqx.Module):
         name: its form.
         family: its family.
         gain: share of the free-run error on selection data that it removes, relative to the same model without it; for
-            named effects, without learned terms.
+            named effects, without learned terms. NaN where free runs diverge with it.
         p_value: under the null distribution of the catalogue's best on noise.
     """
 

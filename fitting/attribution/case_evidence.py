@@ -178,6 +178,8 @@ class FinalEvidence:
             checked, or all runs diverge.
         at_bounds: parameters of the named effects that ended at a bound in the final fit.
         wide_bands: whether prediction bands say nothing: they are wider than the measured motion.
+        replaced: whether a learned term replaced the names since these do not explain free runs; the rest is still
+            evidence for the names.
     """
 
     names: tuple[str, ...]
@@ -189,6 +191,7 @@ class FinalEvidence:
     free_runs_explained: float | None = None
     at_bounds: int = 0
     wide_bands: bool = False
+    replaced: bool = False
 
 
 @dataclass(frozen=True)

@@ -304,4 +304,6 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
         if any(check.holds for check in stand) != bool(names):
             lacking.append("the final model with other names")
     outcome, last_checks = conclude(replace(evidence.final, noise_explains=explains), rules)
+    if evidence.final.replaced and outcome == "unexplained":
+        names = ()
     return Decision(outcome, names, (*checks, *last_checks), lacking[0] if lacking else None)

@@ -73,7 +73,8 @@ def say_what_intervals_hold(report: dict[str, Any]) -> None:
         report: its content so far, with finite numbers only.
     """
     unexplained = report["decision"] == "unexplained"
-    times_noise, beyond = report["times_noise"], report["evidence"]["final"]["surprise"]
+    final = report["evidence"]["final"]
+    times_noise, beyond = report["times_noise"], None if final["replaced"] else final["surprise"]
     left = None
     if times_noise >= RULES.excess:
         left = f"The model's residual is {formatting.number(times_noise)} times the noise"

@@ -106,7 +106,8 @@ def limits(report: Mapping[str, Any]) -> list[str]:
 
 def _of_wide_bands(report: Mapping[str, Any]) -> list[str]:
     """A note where prediction bands say nothing of free runs."""
-    if not ((report["evidence"] or {}).get("final") or {}).get("wide_bands"):
+    final = ((report["evidence"] or {}).get("final")) or {}
+    if not final.get("wide_bands") or final["replaced"]:
         return []
     output = in_words(report["output"])
     return [

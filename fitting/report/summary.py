@@ -189,6 +189,15 @@ def _removed(before: float | None, after: float | None) -> str:
     return formatting.percent(1.0 - after / before)
 
 
+def gain(effect: Mapping[str, Any]) -> str:
+    """What an effect does to the error of free runs on selection data."""
+    if effect["gain"] is None:
+        return "free runs on selection data diverge with it"
+    if effect["gain"] == 1.0:
+        return "free runs on selection data diverge without it, but not with it"
+    return f"with it the error of free runs on selection data is {formatting.smaller(effect['gain'])} than without"
+
+
 def chance(effect: Mapping[str, Any], report: Mapping[str, Any]) -> str:
     """The p-value, as a bound where the number of draws limits it."""
     p = effect["p_value"]

@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fitting import formatting
 from fitting.formatting import open_interval, plain
 from fitting.report.fit_text import fit_lines
 from fitting.report.intervals import is_withheld
 from fitting.report.outputs import in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.proposal import next_lines
-from fitting.report.summary import chance
+from fitting.report.separating import plain_family
+from fitting.report.summary import chance, gain
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -41,8 +41,8 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     lines.append("[Parameters]")
     lines += _parameter_lines(final["parameters"])
     for effect in report["after"]["effects"]:
-        gain = formatting.percent(effect["gain"])
-        lines.append(f"[Effect: {effect['name']}] {effect['family']}, gain {gain}, {chance(effect, report)}")
+        family = plain_family(effect["family"])
+        lines.append(f"[Effect: {effect['name']}] {family}: {gain(effect)}; {chance(effect, report)}")
         if effect["family"] != "unknown":
             lines += _parameter_lines(effect["parameters"])
     if report["unknown"]:

@@ -12,7 +12,7 @@ from fitting.attribution.decisions import tie
 from fitting.report import separating_experiment
 from fitting.report.intervals import is_withheld, say_what_intervals_hold
 from fitting.report.rules import rules_dict
-from fitting.report.summary import _change, _remembering
+from fitting.report.summary import _change, _remembering, gain
 from fitting.report.tables import parameter_rows
 from hdjax.effects import FAMILIES
 
@@ -128,6 +128,18 @@ def test_summary_claims_no_change_where_free_runs_diverge_before_and_after():
 
 
 @pytest.mark.parametrize(
+    ("share", "said"),
+    [
+        (0.5, "with it the error of free runs on selection data is 50 % smaller than without"),
+        (1.0, "free runs on selection data diverge without it, but not with it"),
+        (None, "free runs on selection data diverge with it"),
+    ],
+)
+def test_gain_is_told_in_words(share: float | None, said: str):
+    assert gain({"gain": share}) == said
+
+
+@pytest.mark.parametrize(
     ("memory", "said"),
     [
         (0.028, "correlation time of about 28 ms"),
@@ -177,7 +189,8 @@ def _uncertain_report(
     accounts = {"before": _account(), "after": _account()}
     # Infinity, which the evidence keeps as the largest number.
     told = None if beyond == sys.float_info.max else beyond
-    known = {"times_noise": times_noise, "free_runs_times_expected": told, "evidence": {"final": {"surprise": beyond}}}
+    evidence = {"final": {"surprise": beyond, "replaced": False}}
+    known = {"times_noise": times_noise, "free_runs_times_expected": told, "evidence": evidence}
     return {"decision": decision, "unknown": unknown, "parameters_from": "torque"} | known | accounts
 
 
