@@ -11,7 +11,7 @@ from fitting.attribution.case_evidence import FinalEvidence
 from fitting.attribution.decisions import Outcome, conclude
 from fitting.attribution.rules import RULES
 from fitting.attribution.study import Study
-from fitting.attribution.support import noise_of_torque
+from fitting.attribution.support import noise_of_torque, shows_noise
 from fitting.discrepancy.challenge import Challenge
 from fitting.discrepancy.learn import Unknown, learn_supported
 from fitting.estimation.estimate import Fit
@@ -40,7 +40,7 @@ class Conclusion(eqx.Module):
         runs: its free runs along the selection data.
         runs_at_first: free runs of the base model.
         noise: covariance of the measurement noise of the outputs.
-        left: noise of sensors and torque, where that explains the residual.
+        left: noise of sensors and torque, where that explains the residual, and short segments show it.
         side: the fit of one side's equation at which the final model's K, alpha and B_sp are fixed, if any.
     """
 
@@ -74,6 +74,8 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
     left = challenge.left
     seen = replace(_final_evidence(base, trusted, unknown, covariance), noise_explains=left is not None)
+    if left is not None and not shows_noise(left, trusted.held_out):
+        left = None
     if left is not None:
         covariance = jnp.asarray(left.sensors.covariance)
     claimed, _ = conclude(seen)
