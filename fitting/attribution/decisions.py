@@ -281,7 +281,9 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
     lacking: list[str] = []
     for number, this in enumerate(evidence.rounds, start=1):
         lost = {name: this.lost.get(name, np.inf) for name in this.behind}
-        checks += [tie(name, np.array(blocks), lost[name], rules) for name, blocks in this.behind.items()]
+        # Without the chosen one against itself.
+        others = {name: np.array(blocks) for name, blocks in this.behind.items() if any(blocks)}
+        checks += [tie(name, blocks, lost[name], rules) for name, blocks in others.items()]
         supported = [support(seen, rules) for seen in this.asked]
         checks += [check for those in supported for check in those]
         last = number == len(evidence.rounds)

@@ -15,7 +15,7 @@ from hdjax.parameters import ParameterInfo
 
 # Correlation above which the data determine a combination of two parameters.
 _CORRELATED = 0.9
-_MOST_CORRELATIONS = 8
+_MOST_CORRELATIONS = 5
 _DAMPING = ("B_sp", "mu")
 # Standard error over the prior's above which the data add nothing.
 _NOTHING_NEW = 0.8
@@ -206,15 +206,13 @@ def _absence(parameters: Mapping[str, Mapping[str, Any]], unit: str, paths: list
 
 
 def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note on strongly correlated pairs, strongest first."""
     strong = [c for c in correlations if abs(c["value"] or 0.0) > _CORRELATED]
-    notes = [
-        f"{c['between'][0]} and {c['between'][1]} are correlated by {c['value']:+.3f}: the data "
-        "determine a combination of the two better than each."
-        for c in strong[:_MOST_CORRELATIONS]
-    ]
+    pairs = [f"{' and '.join(c['between'])} ({c['value']:+.3f})" for c in strong[:_MOST_CORRELATIONS]]
     if len(strong) > _MOST_CORRELATIONS:
-        notes.append(f"{len(strong) - _MOST_CORRELATIONS} more pairs are correlated above {_CORRELATED}.")
-    return notes
+        pairs.append(f"{len(strong) - _MOST_CORRELATIONS} more pairs")
+    told = "; ".join(pairs)
+    return [f"Correlated, so that the data determine a combination of both better than each: {told}."] if told else []
 
 
 def largest_twist(outcome: Outcome) -> float:

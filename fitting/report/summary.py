@@ -62,6 +62,8 @@ def _decision(report: Mapping[str, Any]) -> str:
                 rest = f" {left.capitalize()}, which an inexact law of the effect may explain."
         elif report["unknown_remains"]:
             rest = f" Something unknown is also missing: free runs along selection data {_free_runs(report)}."
+        elif report["noise"]["torque"] is None and (after is None or after >= RULES.excess * noise):
+            rest = " Over short segments only noise is left; free runs drift."
         several = bool(report["unknown"]) or len(families) > 1
         subject = "Together they" if several else "The effect" if rest else "It"
         change = _change(subject, report, several=several)

@@ -382,10 +382,7 @@ def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[
         sentence += f", and must be correct there: {words(list(own))} can't compensate an error of 1 %."
     elif own:
         moved = words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
-        sentence += (
-            ", since a log of angles and torque determines inertia and stiffness only relative to the torque: if it is "
-            f"1 % too large there, that changes {moved}."
-        )
+        sentence += f": if it is 1 % too large there, that changes {moved}."
     else:
         sentence += "."
     return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)
