@@ -16,7 +16,7 @@ from fitting.estimation.scales import scales
 from fitting.formatting import Place, in_log_units, words
 from fitting.uncertainty.sandwich import directions
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
-from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
+from hdjax import Drive, Model, OneSideModel, ReducedModel, TwoInertiaModel
 from hdjax.effects import ActuatorEffect
 from hdjax.effects.learned import FAMILY
 from hdjax.parameters import ParameterInfo
@@ -119,7 +119,7 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     return Identifiability(
         reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in vague.items()},
         directions=_directions(fit, found),
-        held=_held(fit, found),
+        held=held_values(fit, found) if isinstance(fit.model, TwoInertiaModel) else (),
         bounds={p: sentence for p, sentence in bounds.items() if sentence is not None},
     )
 
@@ -341,12 +341,17 @@ def parameters_at_bounds(model: Model, name: str) -> list[str]:
 
 # Parameters without any information are not at a bound.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
-    """Fixed values of the drive file that the fit relies on; an effect may correct one."""
-    if not isinstance(fit.model, TwoInertiaModel):
-        return ()
+def held_values(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
+    """Fixed values of the drive file that a fit of both sides or of one side's equation relies on; an effect may
+    correct one.
+
+    Args:
+        fit: the fit.
+        found: its uncertainty.
+    """
     free = {*fit.free.paths, *(effect.corrects for effect in fit.model.effects)}
-    held = tuple(p for p in _HELD if p not in free)
+    known = fit.model.scaled_by if isinstance(fit.model, OneSideModel) else _HELD
+    held = tuple(p for p in _HELD if p in known and p not in free)
     if not held:
         return ()
     products = np.asarray(_products(fit, held))
