@@ -155,7 +155,7 @@ def _of_one_side(report: Mapping[str, Any]) -> list[str]:
         return []
     side, other = ("load", "motor") if report["parameters_from"] == "load equation" else ("motor", "load")
     return [
-        f"The final model does not explain all that acts on the {other}. K, alpha and B_sp are therefore those of the "
+        f"Named effects do not explain all that acts on the {other}. K, alpha and B_sp are therefore those of the "
         f"{side}'s own equation, driven by the {other}'s motion as measured: it leaves no more than noise."
     ]
 
