@@ -91,8 +91,8 @@ def rounded(values: Sequence[float | None], std: float | None) -> list[str]:
     largest = max((abs(v) for v in values if v is not None), default=0.0)
     if not std or not _SMALLEST < largest < _LARGEST:
         return [plain(v, 5) for v in values]
-    decimals = min(max(1 - math.floor(math.log10(std)), 0), 12)
-    return ["n/a" if v is None else f"{v:.{decimals}f}" for v in values]
+    digits = min(1 - math.floor(math.log10(std)), 12)
+    return ["n/a" if v is None else f"{round(v, digits):.{max(digits, 0)}f}" for v in values]
 
 
 def _correlations(correlations: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -10,6 +10,7 @@ import pytest
 from fitting import formatting
 from fitting.attribution.decisions import tie
 from fitting.report import separating_experiment
+from fitting.report.fit_text import rounded
 from fitting.report.intervals import is_withheld, say_what_intervals_hold
 from fitting.report.rules import rules_dict
 from fitting.report.summary import _change, _remembering, gain
@@ -125,6 +126,11 @@ def test_summary_states_the_motor_angle_error_where_the_dynamic_error_is_unchang
 def test_summary_claims_no_change_where_free_runs_diverge_before_and_after():
     said = _change("It", _report_with_errors(None, None, motor=(None, None)))
     assert said == "It explains short segments alone: free runs along test data diverge before and after."
+
+
+def test_values_are_rounded_to_the_second_digit_of_their_error():
+    assert rounded([2113436.0, None], 4.5e5) == ["2110000", "n/a"]
+    assert rounded([0.07614634681, 0.0761463485], 8.6e-10) == ["0.07614634681", "0.07614634850"]
 
 
 @pytest.mark.parametrize(
