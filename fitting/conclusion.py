@@ -11,7 +11,7 @@ from fitting.attribution.case_evidence import FinalEvidence
 from fitting.attribution.decisions import Outcome, conclude
 from fitting.attribution.rules import RULES
 from fitting.attribution.study import Study
-from fitting.attribution.support import noise_of_torque
+from fitting.attribution.support import noise_of_torque, shows_noise
 from fitting.discrepancy.challenge import Challenge
 from fitting.discrepancy.learn import Unknown, learn_supported
 from fitting.estimation.estimate import Fit
@@ -40,7 +40,7 @@ class Conclusion(eqx.Module):
         runs: its free runs along the selection data.
         runs_at_first: free runs of the base model.
         noise: covariance of the measurement noise of the outputs.
-        left: noise of sensors and torque, where that explains the residual.
+        left: noise of sensors and torque, where that explains the residual, and short segments show it.
         side: the fit of one side's equation at which the final model's K, alpha and B_sp are fixed, if any.
     """
 
@@ -74,42 +74,58 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
     left = challenge.left
     seen = replace(_final_evidence(base, trusted, unknown, covariance), noise_explains=left is not None)
+    if left is not None and not shows_noise(left, trusted.held_out):
+        left = None
     if left is not None:
         covariance = jnp.asarray(left.sensors.covariance)
-    outcome, _ = conclude(seen)
-    if outcome == "effect_found" and max(seen.excess) < RULES.excess:
+    claimed, _ = conclude(seen)
+    if claimed == "effect_found" and max(seen.excess) < RULES.excess:
         # The residual with the names is hardly more than noise.
         unknown, seen = None, replace(seen, learned=False)
-
-    def along_selection(fitted: Fit, hold: Hold) -> tuple[FreeRun, ...]:
-        return free_runs(fitted, study.data[hold][1], noise=covariance, halo=study.setting.halo)
-
     study.progress("final fit over long horizons")
     current = trusted if unknown is None else unknown.trial
     fitted, side = _fitted_to_the_end(current.training, seen, study)
     names = {e.name for e in trusted.model.effects}
     seen = replace(seen, at_bounds=sum(len(parameters_at_bounds(fitted.model, name)) for name in names))
-    at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
-    if outcome == "effect_found":
+    at_first = _along_selection(base.training, base.hold, study, covariance)
+    runs = _along_selection(fitted, current.hold, study, covariance)
+    outcome = claimed
+    if claimed == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
         explained = share_explained(at_first, runs, current.held_out, covariance)
         seen = replace(seen, free_runs_explained=explained)
         # Bands are of first order: chaotic motion exceeds them, though short segments leave only noise.
         much = explained is None or explained >= RULES.free_run_explained
         if not (much and challenge.seen.enough):
-            seen = replace(seen, surprise=surprise(fitted, runs, current.held_out, **known))
+            ratio = surprise(fitted, runs, current.held_out, **known)
+            seen = replace(seen, surprise=ratio, wide_bands=ratio is None)
         outcome, _ = conclude(seen)
-        if outcome == "unexplained":
-            # A learned term that follows long stretches may replace names that do not.
-            instead = learn_supported(base, study)
-            if instead is not None:
-                seen_instead = _final_evidence(base, base, instead, covariance)
-                other, side_instead = _fitted_to_the_end(instead.trial.training, seen_instead, study)
-                instead_runs = along_selection(other, instead.trial.hold)
-                if rms_error(instead_runs) < rms_error(runs):
-                    trusted, unknown, fitted, runs = base, instead, other, instead_runs
-                    seen, side = seen_instead, side_instead
-    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left, side)
+    found = Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left, side)
+    return _with_term_in_place(found, base, study, noise) if outcome != claimed else found
+
+
+def _with_term_in_place(found: Conclusion, base: Trial, study: Study, noise: MeasurementNoise) -> Conclusion:
+    """The conclusion with a learned term in place of names that do not follow long stretches, where it does so better;
+    else the same. The evidence against the names remains."""
+    instead = learn_supported(base, study)
+    if instead is None:
+        return found
+    # Not what the names left, which may have been attributed to noise.
+    covariance = noise.and_beside(instead.trial.training).covariance
+    seen = _final_evidence(base, base, instead, covariance)
+    fitted, side = _fitted_to_the_end(instead.trial.training, seen, study)
+    runs = _along_selection(fitted, instead.trial.hold, study, covariance)
+    if not rms_error(runs) < rms_error(found.runs):
+        return found
+    at_first = _along_selection(base.training, base.hold, study, covariance)
+    seen = replace(found.seen, replaced=True)
+    return Conclusion(found.outcome, seen, base, instead, fitted, runs, at_first, covariance, None, side)
+
+
+def _along_selection(
+    fitted: Fit, hold: Hold, study: Study, covariance: Float[Array, "outputs outputs"]
+) -> tuple[FreeRun, ...]:
+    return free_runs(fitted, study.data[hold][1], noise=covariance, halo=study.setting.halo)
 
 
 def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[Fit, Fit | None]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import numpy as np
 
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import CaseEvidence
@@ -133,7 +134,7 @@ class _Closed:
             setting=self.study.setting,
             after_substeps=end.fitted.substeps,
             stretches=self.study.data[final.hold],
-            surprise=end.seen.surprise,
+            surprise=None if end.seen.replaced else end.seen.surprise,
             parameters_from=source_of(end.side),
             put_back=late,
             seconds=clock.laps,
@@ -166,7 +167,7 @@ class _Closed:
         if end.unknown is None:
             return findings
         effect = after.model.effect(end.unknown.chosen.form.name)
-        gain = 1.0 - rms_error(end.runs) / by_name
+        gain = _gain(rms_error(end.runs), by_name)
         return (*findings, Finding(effect, effect.name, effect.family, gain, end.unknown.p_value))
 
     def _without(self) -> dict[str, Trial]:
@@ -201,8 +202,13 @@ def _named_findings(
     """
     effects = {e.name: e for e in final.effects}
     found = [
-        Finding(effects.get(w.name), w.name, w.family, 1.0 - rmse / rmse_without[w.name], w.p_value)
+        Finding(effects.get(w.name), w.name, w.family, _gain(rmse, rmse_without[w.name]), w.p_value)
         for w in (this.winner for this in rounds if this.accepted)
         if w.name in rmse_without
     ]
-    return tuple(sorted(found, key=lambda f: -f.gain))
+    return tuple(sorted(found, key=lambda f: (np.isnan(f.gain), -f.gain)))
+
+
+def _gain(rmse: float, without: float) -> float:
+    """Share of an error that an effect removes; NaN where free runs diverge with it."""
+    return 1.0 - rmse / without if np.isfinite(rmse) else np.nan

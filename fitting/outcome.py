@@ -33,7 +33,7 @@ class Finding(eqx.Module):
         name: its form.
         family: its family.
         gain: share of the free-run error on selection data that it removes, relative to the same model without it; for
-            named effects, without learned terms.
+            named effects, without learned terms. NaN where free runs diverge with it.
         p_value: under the null distribution of the catalogue's best on noise.
     """
 
@@ -131,7 +131,7 @@ class Loop(eqx.Module):
         after_substeps: solver steps in a sample interval of the final model.
         stretches: training and selection stretches.
         surprise: error of free runs along selection stretches over their bands, where effects were accepted that leave
-            more than noise, or do not explain them; None otherwise, or where bands diverge.
+            more than noise, or do not explain them; None otherwise, or where bands say nothing.
         parameters_from: "torque"; or the "load equation" or "motor equation" for K, alpha and B_sp of the final model,
             see [`fitting.one_side_check`][].
         put_back: time offset subtracted from each log's clock [s], so that a line is in phase.

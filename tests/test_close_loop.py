@@ -10,13 +10,16 @@ import pytest
 
 import rig
 from fitting.attribution.case_evidence import ChallengeEvidence
+from fitting.attribution.decisions import decide
 from fitting.attribution.effect_search import _holds_given_up
+from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round, Verdict
 from fitting.discrepancy.challenge import Challenge, model_evidence
 from fitting.estimation.experiment import Experiment, experiment_from_log
-from fitting.loop import close_loop
+from fitting.loop import _named_findings, close_loop
 from fitting.outcome import Loop
 from fitting.search_options import SearchOptions
+from fitting.uncertainty.noise_model import noise_model
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
@@ -160,6 +163,17 @@ def test_ground_spring_is_learned_and_not_identified_as_gravity(stiffness: float
     assert found.after.rmse["selection"] < 0.01 * found.before.rmse["selection"]
 
 
+def test_effects_with_which_free_runs_diverge_come_last_and_without_a_gain(friction_loop):
+    (this, *_) = friction_loop[0].rounds
+    rounds = [
+        replace(this, verdicts=(replace(this.winner, name=name),), accepted=True) for name in ("one", "two", "three")
+    ]
+    without = {"one": 4.0, "two": np.inf, "three": 8.0}
+    model = friction_loop[0].after.model
+    assert [f.gain for f in _named_findings(rounds, model, 2.0, without)] == [1.0, 0.75, 0.5]
+    assert all(np.isnan(f.gain) for f in _named_findings(rounds, model, np.inf, without))
+
+
 @pytest.mark.parametrize(
     ("tried", "given_up"),
     [
@@ -205,16 +219,19 @@ def test_effect_that_does_not_explain_free_runs_is_unexplained(monkeypatch: pyte
 
 @pytest.mark.slow
 def test_learned_term_replaces_an_effect_that_does_not_explain_free_runs(monkeypatch: pytest.MonkeyPatch):
-    """Quadratic damping is accepted in place of dry friction, by substituted evidence; a learned jump explains more."""
+    """Quadratic damping is accepted in place of dry friction, by substituted evidence; a learned jump explains more.
+    What damping leaves was attributed to noise of the torque: not so beside the jump."""
     module, loop_module = import_module("fitting.conclusion"), import_module("fitting.loop")
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
+    monkeypatch.setattr(module, "share_explained", lambda *args: 0.5)
     explains = {"excess": (1.0,), "excess_at_first": (9.0,), "learned": False}
     final = module._final_evidence
     monkeypatch.setattr(module, "_final_evidence", lambda *args: replace(final(*args), **explains))
 
     def unchallenged(base, named, *args, **options):
         seen = model_evidence(named, options["noise"])
-        return Challenge(named, None, None, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
+        left = noise_model(named.training, options["noise"].covariance, predictable=RULES.innovations)
+        return Challenge(named, None, left, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
 
     monkeypatch.setattr(loop_module, "challenge_names", unchallenged)
     experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)
@@ -222,4 +239,10 @@ def test_learned_term_replaces_an_effect_that_does_not_explain_free_runs(monkeyp
     assert [f.name for f in loop.findings] == ["learned_mesh_torque"]
     assert loop.doubted == ("quadratic_damping",)
     assert (loop.decision, loop.surprise) == ("unexplained", None)
+    assert (loop.torque_noise, loop.noise_memory) == (None, None)
+    assert np.sqrt(float(loop.noise[0, 0])) == pytest.approx(REDUCED_NOISE, rel=0.2)
+    # The evidence is that against the damping.
+    assert loop.case.final.names == ("quadratic_damping",) and loop.case.final.surprise == 1.4
+    assert any(check.rule == "surprise" and not check.holds for check in loop.checks)
+    assert decide(loop.case).lacking is None and decide(loop.case).names == ()
     assert loop.after.rmse["selection"] < 1.2 * REDUCED_NOISE

@@ -75,7 +75,11 @@ def test_side_that_does_not_rub_supplies_the_parameters(source: str):
     assert fixed.held == long.held == MESH
     assert float(both.model.get("viscous_motor_friction.b")) != float(found.model.get("viscous_motor_friction.b"))
 
-    known, _ = of_parameters(both, drive_from=side)
+    known, told = of_parameters(both, drive_from=side)
+    # K is in proportion to the load's inertia in the load's equation, which lacks the motor's.
+    held = {h.path: h.changes["K"] for h in told.held}
+    assert set(held) == ({"J_l"} if source == "load equation" else {"J_m"})
+    assert source != "load equation" or held == {"J_l": pytest.approx(0.01, rel=0.05)}
     own = uncertainty(both).estimates["viscous_motor_friction.b"]
     assert known.estimates == uncertainty(side).estimates | {"viscous_motor_friction.b": own}
     assert np.all(np.linalg.eigvalsh(known.correlation) > 0.0)

@@ -175,10 +175,13 @@ class FinalEvidence:
             the noise.
         excess_at_first: likewise of the base model.
         noise_explains: whether coloured noise of sensors and torque explains the residual.
-        surprise: free-run error over its prediction band; None where that is not checked, or the band diverges.
+        surprise: free-run error over its prediction band; None where that is not checked, or the band says nothing.
         free_runs_explained: share of the free runs' error beyond noise that the effects remove; None where that is not
             checked, or all runs diverge.
         at_bounds: parameters of the named effects that ended at a bound in the final fit.
+        wide_bands: whether prediction bands say nothing: they are wider than the measured motion.
+        replaced: whether a learned term replaced the names since these do not explain free runs; the rest is still
+            evidence for the names.
     """
 
     names: tuple[str, ...]
@@ -189,6 +192,8 @@ class FinalEvidence:
     surprise: float | None = None
     free_runs_explained: float | None = None
     at_bounds: int = 0
+    wide_bands: bool = False
+    replaced: bool = False
 
 
 @dataclass(frozen=True)

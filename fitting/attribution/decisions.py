@@ -294,7 +294,9 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
     lacking: list[str] = []
     for number, this in enumerate(evidence.rounds, start=1):
         lost = {name: this.lost.get(name, np.inf) for name in this.behind}
-        checks += [tie(name, np.array(blocks), lost[name], rules) for name, blocks in this.behind.items()]
+        # Without the chosen one against itself.
+        others = {name: np.array(blocks) for name, blocks in this.behind.items() if any(blocks)}
+        checks += [tie(name, blocks, lost[name], rules) for name, blocks in others.items()]
         supported = [support(seen, rules) for seen in this.asked]
         checks += [check for those in supported for check in those]
         last = number == len(evidence.rounds)
@@ -317,4 +319,6 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
         if any(check.holds for check in stand) != bool(names):
             lacking.append("the final model with other names")
     outcome, last_checks = conclude(replace(evidence.final, noise_explains=explains), rules)
+    if evidence.final.replaced and outcome == "unexplained":
+        names = ()
     return Decision(outcome, names, (*checks, *last_checks), lacking[0] if lacking else None)

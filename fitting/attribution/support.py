@@ -99,6 +99,20 @@ def is_noise(left: NoiseModel | None) -> bool:
     return left is not None and all(check.holds for check in only_noise(noise_evidence(left)))
 
 
+def shows_noise(left: NoiseModel, found: Fit) -> bool:
+    """Whether a residual over short segments shows the sensor noise that explains it. Initial states absorb slow noise
+    of an angle, but not of the twist.
+
+    Where the linearised motion explodes, as in chaos, the noise model takes what it leaves for very slow noise.
+
+    Args:
+        left: the noise model.
+        found: the fit over short segments.
+    """
+    said = float(np.sqrt(left.sensors.covariance[-1, -1]))
+    return found.model.measured[-1] != "dynamic_error" or said < RULES.excess * found.principal_std
+
+
 def noise_of_torque(left: NoiseModel | None) -> float | None:
     """Standard deviation of the torque noise [N m]; None where sensor noise alone explains as much."""
     return left.std if left is not None and left.likelihood - left.without > RULES.noise_gain else None

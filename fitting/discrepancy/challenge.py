@@ -75,8 +75,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
             if instead is None:
                 seen = seen.answered("instead", None)
                 continue
-            come_out = share_of(named.model, instead, named.training) if named.hold == base.hold else 0.0
-            seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
+            seen = seen.answered("instead", seen_as(instead.trial), come_out=_come_out(base, named, instead))
         else:
             beside = _learned(standing, study.with_substeps(named.training.substeps))
             if beside is not None:
@@ -99,6 +98,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         one, other = beside.chosen, instead.chosen
         seen = replace(
             seen,
+            come_out=_come_out(base, named, instead),
             shown=nonzero_effects(beside.trial.training, names) == names,
             one_shape=(one.form, one.variables) == (other.form, other.variables)
             and any(other.variables == (e.one_shape_of,) for e in named.model.effects),
@@ -111,6 +111,11 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         seen = replace(seen, behind=tuple(map(float, behind)))
     tied = any(check.holds for check in unknown_ties(seen))
     return Challenge(named, beside, left, instead if tied else None, seen)
+
+
+def _come_out(base: Trial, named: Trial, instead: Unknown) -> float:
+    """Share of a replacing term that the named effects reproduce."""
+    return share_of(named.model, instead, named.training) if named.hold == base.hold else 0.0
 
 
 def _learned(standing: Standing, study: Study) -> Unknown | None:

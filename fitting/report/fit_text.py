@@ -71,7 +71,7 @@ def _derived_rows(derived: Mapping[str, Any]) -> list[list[str]]:
 def _figures(entry: Mapping[str, Any]) -> list[str]:
     """Value, standard error, percent and interval, to the digits justified by the standard error."""
     ends = [e for e in entry["ci95"] if e is not None]
-    value, std, *known = _rounded([entry["value"], entry["std"], *ends], entry["std"])
+    value, std, *known = rounded([entry["value"], entry["std"], *ends], entry["std"])
     return [value, std, plain(entry["percent"], 2), open_interval(entry["ci95"]).format(*known)]
 
 
@@ -81,18 +81,18 @@ def _posterior(found: Mapping[str, Any] | None, parameters: Mapping[str, Any]) -
         return []
     rows = [["", *(f"{100 * q:g} %" for q in QUANTILES), "R-hat", "effective", "unit"]]
     for path, e in found["parameters"].items():
-        quantiles = _rounded(list(e["quantiles"].values()), parameters[path]["std"])
+        quantiles = rounded(list(e["quantiles"].values()), parameters[path]["std"])
         rows.append([path, *quantiles, plain(e["r_hat"]), plain(e["effective_samples"]), parameters[path]["unit"]])
     return _table(rows, left=(0, len(rows[0]) - 1)) + _prose([found["says"]])
 
 
-def _rounded(values: Sequence[float | None], std: float | None) -> list[str]:
+def rounded(values: Sequence[float | None], std: float | None) -> list[str]:
     """Numbers to the second digit of their standard error."""
     largest = max((abs(v) for v in values if v is not None), default=0.0)
     if not std or not _SMALLEST < largest < _LARGEST:
         return [plain(v, 5) for v in values]
-    decimals = min(max(1 - math.floor(math.log10(std)), 0), 12)
-    return ["n/a" if v is None else f"{v:.{decimals}f}" for v in values]
+    digits = min(1 - math.floor(math.log10(std)), 12)
+    return ["n/a" if v is None else f"{round(v, digits):.{max(digits, 0)}f}" for v in values]
 
 
 def _correlations(correlations: Sequence[Mapping[str, Any]]) -> list[str]:

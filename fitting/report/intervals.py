@@ -73,12 +73,17 @@ def say_what_intervals_hold(report: dict[str, Any]) -> None:
         report: its content so far, with finite numbers only.
     """
     unexplained = report["decision"] == "unexplained"
-    times_noise, beyond = report["times_noise"], report["free_runs_times_expected"]
+    final = report["evidence"]["final"]
+    times_noise, beyond = report["times_noise"], None if final["replaced"] else final["surprise"]
     left = None
     if times_noise >= RULES.excess:
         left = f"The model's residual is {formatting.number(times_noise)} times the noise"
     elif beyond is not None and beyond > RULES.surprise:
-        left = f"Free runs err by {formatting.number(beyond)} times what noise and uncertainty allow"
+        ratio = report["free_runs_times_expected"]
+        # An infinite ratio is null in a report.
+        left = "Free runs diverge"
+        if ratio is not None:
+            left = f"Free runs err by {formatting.number(ratio)} times what noise and uncertainty allow"
     learned = report.get("unknown") or {}
     names = formatting.words(list(report["before"]["parameters"]))
     if (learned.get("place"), learned.get("quantity"), report["parameters_from"]) == ("mesh", "torque", "torque"):

@@ -5,6 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.report.outcome import Outcome
+from fitting.report.outputs import in_words
 from fitting.report.separating import plain_family
 from fitting.report.steps import beyond_prediction
 from fitting.uncertainty.identifiability import Identifiability
@@ -14,7 +15,7 @@ from hdjax.parameters import ParameterInfo
 
 # Correlation above which the data determine a combination of two parameters.
 _CORRELATED = 0.9
-_MOST_CORRELATIONS = 8
+_MOST_CORRELATIONS = 5
 _DAMPING = ("B_sp", "mu")
 # Standard error over the prior's above which the data add nothing.
 _NOTHING_NEW = 0.8
@@ -96,10 +97,23 @@ def limits(report: Mapping[str, Any]) -> list[str]:
             if report["decision"] != "fit_only"
             else "The logs are too short to reserve test data: the errors are those of the fitted data."
         )
+    notes += _of_wide_bands(report)
     drifting = beyond_prediction(report, final["rmse"]["selection"])
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _of_wide_bands(report: Mapping[str, Any]) -> list[str]:
+    """A note where prediction bands say nothing of free runs."""
+    final = ((report["evidence"] or {}).get("final")) or {}
+    if not final.get("wide_bands") or final["replaced"]:
+        return []
+    output = in_words(report["output"])
+    return [
+        f"Whether free runs err by more than noise and uncertainty allow can't be told: their prediction bands are "
+        f"wider than the measured {output} itself."
+    ]
 
 
 def _of_scale(report: Mapping[str, Any]) -> list[str]:
@@ -141,7 +155,7 @@ def _of_one_side(report: Mapping[str, Any]) -> list[str]:
         return []
     side, other = ("load", "motor") if report["parameters_from"] == "load equation" else ("motor", "load")
     return [
-        f"The final model does not explain all that acts on the {other}. K, alpha and B_sp are therefore those of the "
+        f"Named effects do not explain all that acts on the {other}. K, alpha and B_sp are therefore those of the "
         f"{side}'s own equation, driven by the {other}'s motion as measured: it leaves no more than noise."
     ]
 
@@ -192,15 +206,13 @@ def _absence(parameters: Mapping[str, Mapping[str, Any]], unit: str, paths: list
 
 
 def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A note on strongly correlated pairs, strongest first."""
     strong = [c for c in correlations if abs(c["value"] or 0.0) > _CORRELATED]
-    notes = [
-        f"{c['between'][0]} and {c['between'][1]} are correlated by {c['value']:+.3f}: the data "
-        "determine a combination of the two better than each."
-        for c in strong[:_MOST_CORRELATIONS]
-    ]
+    pairs = [f"{' and '.join(c['between'])} ({c['value']:+.3f})" for c in strong[:_MOST_CORRELATIONS]]
     if len(strong) > _MOST_CORRELATIONS:
-        notes.append(f"{len(strong) - _MOST_CORRELATIONS} more pairs are correlated above {_CORRELATED}.")
-    return notes
+        pairs.append(f"{len(strong) - _MOST_CORRELATIONS} more pairs")
+    told = "; ".join(pairs)
+    return [f"Correlated, so that the data determine a combination of both better than each: {told}."] if told else []
 
 
 def largest_twist(outcome: Outcome) -> float:

@@ -15,7 +15,7 @@ from fitting.report.plots import Plot
 from fitting.report.posterior import QUANTILES
 from fitting.report.proposal import next_lines
 from fitting.report.separating import plain_family
-from fitting.report.summary import chance
+from fitting.report.summary import chance, gain
 from fitting.report.tables import changes, parameter_rows
 from fitting.report.web_page import environment
 
@@ -31,7 +31,6 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
     """
     filters = {
         "percent": formatting.percent,
-        "smaller": formatting.smaller,
         "superscripts": formatting.superscripts,
         "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
         "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
@@ -60,6 +59,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
             twist_unit=report["units"]["dynamic_error"],
             others=others(report),
             in_words=in_words,
+            gain=gain,
             chance=lambda effect: chance(effect, report),
             rows=parameter_rows(report, final),
             changes=changes(report),

@@ -62,6 +62,8 @@ def _decision(report: Mapping[str, Any]) -> str:
                 rest = f" {left.capitalize()}, which an inexact law of the effect may explain."
         elif report["unknown_remains"]:
             rest = f" Something unknown is also missing: free runs along selection data {_free_runs(report)}."
+        elif report["noise"]["torque"] is None and (after is None or after >= RULES.excess * noise):
+            rest = " Over short segments only noise is left; free runs drift."
         several = bool(report["unknown"]) or len(families) > 1
         subject = "Together they" if several else "The effect" if rest else "It"
         change = _change(subject, report, several=several)
@@ -77,7 +79,7 @@ def _decision(report: Mapping[str, Any]) -> str:
         return f"{opening} {_change(f'Together with a {learned} it' if families else f'A {learned}', report)}"
     if report["evidence"]["final"]["at_bounds"]:
         return f"{opening} A parameter of what was found has ended at a bound: its law does not fit."
-    if report["free_runs_times_expected"] is not None:
+    if report["evidence"]["final"]["surprise"] is not None:
         return f"{opening} Short segments hardly show it: free runs along selection data {_free_runs(report)}."
     depends = f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)"
     if left["explained_share"] < _NO_SHARE:
@@ -187,6 +189,15 @@ def _removed(before: float | None, after: float | None) -> str:
     if before is None or after is None:
         return "much"
     return formatting.percent(1.0 - after / before)
+
+
+def gain(effect: Mapping[str, Any]) -> str:
+    """What an effect does to the error of free runs on selection data."""
+    if effect["gain"] is None:
+        return "free runs on selection data diverge with it"
+    if effect["gain"] == 1.0:
+        return "free runs on selection data diverge without it, but not with it"
+    return f"with it the error of free runs on selection data is {formatting.smaller(effect['gain'])} than without"
 
 
 def chance(effect: Mapping[str, Any], report: Mapping[str, Any]) -> str:

@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fitting import formatting
 from fitting.formatting import open_interval, plain
-from fitting.report.fit_text import fit_lines
+from fitting.report.fit_text import fit_lines, rounded
 from fitting.report.intervals import is_withheld
 from fitting.report.outputs import in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.proposal import next_lines
-from fitting.report.summary import chance
+from fitting.report.separating import plain_family
+from fitting.report.summary import chance, gain
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -41,16 +41,16 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     lines.append("[Parameters]")
     lines += _parameter_lines(final["parameters"])
     for effect in report["after"]["effects"]:
-        gain = formatting.percent(effect["gain"])
-        lines.append(f"[Effect: {effect['name']}] {effect['family']}, gain {gain}, {chance(effect, report)}")
+        family = plain_family(effect["family"])
+        lines.append(f"[Effect: {effect['name']}] {family}: {gain(effect)}; {chance(effect, report)}")
         if effect["family"] != "unknown":
             lines += _parameter_lines(effect["parameters"])
     if report["unknown"]:
         learned = report["unknown"]
         lines += [f"[Learned {learned['quantity']}: {learned['name']}]", f"    {learned['says']}"]
-    for other in report["alternatives"]:
-        kind = "ruled out" if other["separable"] else "TIE"
-        lines.append(f"[Alternative: {other['name']}] {kind}. {other['separating_experiment']}")
+    # The notes tell ties.
+    for other in (o for o in report["alternatives"] if o["separable"]):
+        lines.append(f"[Ruled out] {other['name']}: the selection data distinguish it from {other['instead_of']}.")
     for note in report["cannot_tell"]:
         lines.append(f"[Note] {note}")
     lines += [f"[Next experiment] {sentence}" for sentence in next_lines(report)]
@@ -63,11 +63,11 @@ def _parameter_lines(parameters: Mapping[str, Any]) -> list[str]:
 
 
 def _parameter_line(estimate: Mapping[str, Any]) -> str:
-    value, std = estimate["value"], estimate["std"]
-    ends = [plain(e, 6) for e in estimate["ci95"] if e is not None]
+    std = estimate["std"]
+    value, *ends = rounded([estimate["value"], *(e for e in estimate["ci95"] if e is not None)], std)
     span = f"[{', '.join(ends)}]" if len(ends) == 2 else open_interval(estimate["ci95"]).format(*ends)
     span = "interval withheld" if is_withheld(estimate) else span
-    share = f" ({100 * std / abs(value):.2g} %)" if value and std is not None else ""
+    share = f" ({100 * std / abs(estimate['value']):.2g} %)" if estimate["value"] and std is not None else ""
     flag = f"  {estimate['flag'].upper()}" if estimate["flag"] else ""
     unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"
-    return f"{plain(value, 6)} +/- {plain(std, 2)}{share}{unit}  {span}{flag}"
+    return f"{value} +/- {plain(std, 2)}{share}{unit}  {span}{flag}"

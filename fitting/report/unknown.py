@@ -69,7 +69,7 @@ def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] |
         "gain": finding.gain,
         "p_value": finding.p_value,
         "rmse": {
-            "before": outcome.after.rmse["selection"] / max(1.0 - finding.gain, 1e-12),
+            "before": outcome.after.rmse["selection"] / (1.0 - finding.gain) if finding.gain < 1.0 else None,
             "after": outcome.after.rmse["selection"],
         },
         "doubted": list(outcome.doubted),

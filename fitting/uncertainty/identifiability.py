@@ -1,6 +1,6 @@
 """Identifiability: undetermined directions, insignificant parameters, and the influence of fixed values."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -16,14 +16,17 @@ from fitting.estimation.scales import scales
 from fitting.formatting import Place, in_log_units, words
 from fitting.uncertainty.sandwich import directions
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
-from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
+from hdjax import Drive, Model, OneSideModel, ReducedModel, TwoInertiaModel
 from hdjax.effects import ActuatorEffect
+from hdjax.effects.learned import FAMILY
 from hdjax.parameters import ParameterInfo
 
 # A direction is not determined if two standard errors along it exceed 40 %.
 _WEAK = 0.2
 # Parameters with less than this share of a direction are omitted.
 _SHARE = 0.2
+# Most members of a direction whose moves are told.
+_MOST_MOVES = 3
 # Values of the drive file that no log of angles and torque can verify; their errors are in units of 1 %.
 _HELD = ("J_m", "J_l")
 _PERCENT = 0.01
@@ -96,13 +99,16 @@ class Identifiability(eqx.Module):
 def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     """Find what the logs of a fit do not determine.
 
+    Coefficients of learned functions have no meaning one by one: of them only their influence on the named parameters
+    is considered.
+
     Args:
         fit: the fit.
         found: its uncertainty.
     """
     if not fit.free.paths:
         return Identifiability({}, (), (), {})
-    estimates = found.estimates
+    estimates = {p: found.estimates[p] for p in _named(fit)}
     x_max = scales(fit.stretches, fit.model).x_max
     x_unit = "rad" if isinstance(fit.model.drive, Drive) else "[x]"
     known, first = fit.model.parameters(), fit.problem.model
@@ -113,7 +119,7 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     return Identifiability(
         reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in vague.items()},
         directions=_directions(fit, found),
-        held=_held(fit, found),
+        held=held_values(fit, found) if isinstance(fit.model, TwoInertiaModel) else (),
         bounds={p: sentence for p, sentence in bounds.items() if sentence is not None},
     )
 
@@ -199,31 +205,56 @@ def _reach(estimate: Estimate) -> float:
     return float(stdtrit(estimate.degrees_of_freedom, 0.975)) * estimate.std
 
 
+def _named(fit: Fit) -> list[str]:
+    """The free parameters without the coefficients of learned functions."""
+    learned = tuple(f"{e.name}." for e in fit.model.effects if e.family == FAMILY)
+    return [path for path in fit.free.paths if not path.startswith(learned)]
+
+
 def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:
-    """Principal axes of the free vector's covariance, whose entries are of order one."""
-    free = fit.free
-    units = {
-        p: 1.0 if logarithmic else float(s)
-        for p, logarithmic, s in zip(free.paths, free.logarithmic, np.asarray(free.scale), strict=True)
-    }
-    made = []
-    for std, vector in directions(found.covariance):
-        weights = dict(zip(free.paths, vector.tolist(), strict=True))
-        largest = max(abs(w) for w in weights.values())
-        part = {p: w / largest for p, w in weights.items() if abs(w) >= _SHARE * largest}
-        sentence = _not_determined(fit, part, units) if std > _WEAK and len(part) > 1 else None
-        made.append(Direction(weights, tuple(part), units, std, sentence))
-    return tuple(made)
+    """Principal axes of the covariance of the named parameters, in units of the free vector, which are of order one.
 
-
-def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, float]) -> str:
-    """A weak direction as a sentence.
-
-    Args:
-        fit: the fit.
-        part: weights of its members, the largest of size one.
-        units: of each parameter.
+    A part of the whole covariance is that of its parameters where all others are fitted as well.
     """
+    paths = _named(fit)
+    own = [fit.free.paths.index(path) for path in paths]
+    logarithmic, scale = np.array(fit.free.logarithmic)[own], np.asarray(fit.free.scale)[own]
+    units = dict(zip(paths, np.where(logarithmic, 1.0, scale).tolist(), strict=True))
+    made: list[Direction] = []
+    for std, vector in directions(found.covariance[np.ix_(own, own)]):
+        weights = dict(zip(paths, vector.tolist(), strict=True))
+        largest = max(abs(w) for w in weights.values())
+        members = tuple(p for p, w in weights.items() if abs(w) >= _SHARE * largest)
+        made.append(Direction(weights, members, units, std, None))
+    told = _not_separated(fit, [d for d in made if d.std > _WEAK])
+    return tuple(replace(d, sentence=told.get(i)) for i, d in enumerate(made))
+
+
+def _not_separated(fit: Fit, weak: Sequence[Direction]) -> dict[int, str]:
+    """Sentences on weak directions, by their places. Those that share members are told together: the logs do not
+    determine the products that are constant along one of them either."""
+    told: dict[int, str] = {}
+    rest = list(range(len(weak)))
+    while rest:
+        first, *rest = rest
+        members, together = set(weak[first].members), 1
+        while met := [i for i in rest if members.intersection(weak[i].members)]:
+            members.update(*(weak[i].members for i in met))
+            together += len(met)
+            rest = [i for i in rest if i not in met]
+        if together == 1 and 1 < len(members) <= _MOST_MOVES:
+            told[first] = _not_determined(fit, weak[first])
+        elif len(members) > 1:
+            names = words([p for p in fit.free.paths if p in members])
+            several = "one combination of them is" if together == 1 else f"{together} combinations of them are"
+            told[first] = f"The logs do not separate {names}: {several} not determined."
+    return told
+
+
+def _not_determined(fit: Fit, weak: Direction) -> str:
+    """A weak direction as a sentence."""
+    units, largest = weak.units, max(abs(w) for w in weak.weights.values())
+    part = {p: weak.weights[p] / largest for p in weak.members}
     logarithmic = dict(zip(fit.free.paths, fit.free.logarithmic, strict=True))
     values = {p: float(fit.model.get(p)) for p in part}
     # Relative changes are easier to read; near zero they do not exist.
@@ -310,12 +341,17 @@ def parameters_at_bounds(model: Model, name: str) -> list[str]:
 
 # Parameters without any information are not at a bound.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
-    """Fixed values of the drive file that the fit relies on; an effect may correct one."""
-    if not isinstance(fit.model, TwoInertiaModel):
-        return ()
+def held_values(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
+    """Fixed values of the drive file that a fit of both sides or of one side's equation relies on; an effect may
+    correct one.
+
+    Args:
+        fit: the fit.
+        found: its uncertainty.
+    """
     free = {*fit.free.paths, *(effect.corrects for effect in fit.model.effects)}
-    held = tuple(p for p in _HELD if p not in free)
+    known = fit.model.scaled_by if isinstance(fit.model, OneSideModel) else _HELD
+    held = tuple(p for p in _HELD if p in known and p not in free)
     if not held:
         return ()
     products = np.asarray(_products(fit, held))
@@ -327,7 +363,7 @@ def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
     relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
     classical = np.linalg.pinv(information, hermitian=True)
     robust = np.diag(found.covariance) / np.diag(classical)
-    made = []
+    named, made = set(_named(fit)), []
     for i, path in enumerate(held):
         own = products[count + i, count + i] - coupling[:, i] @ classical @ coupling[:, i]
         if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
@@ -337,8 +373,8 @@ def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
             _held_one(
                 fit,
                 path,
-                dict(zip(found.estimates, change.tolist(), strict=True)),
-                dict(zip(found.estimates, std_if_free.tolist(), strict=True)),
+                {p: value for p, value in zip(found.estimates, change.tolist(), strict=True) if p in named},
+                {p: value for p, value in zip(found.estimates, std_if_free.tolist(), strict=True) if p in named},
             )
         )
     return tuple(made)
@@ -351,10 +387,7 @@ def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[
         sentence += f", and must be correct there: {words(list(own))} can't compensate an error of 1 %."
     elif own:
         moved = words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
-        sentence += (
-            ", since a log of angles and torque determines inertia and stiffness only relative to the torque: if it is "
-            f"1 % too large there, that changes {moved}."
-        )
+        sentence += f": if it is 1 % too large there, that changes {moved}."
     else:
         sentence += "."
     return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)

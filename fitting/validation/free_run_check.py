@@ -42,7 +42,7 @@ def surprise(
     """Rms error of free runs along held-out stretches, over the rms of their prediction bands. Bands contain the
     residual of short segments, and the uncertainty of parameters and initial state.
 
-    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where its bands diverge.
+    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where bands say nothing.
 
     Args:
         final: the model with its effects.
@@ -63,8 +63,11 @@ def _short_error(held_out: Fit, noise: Float[Array, "outputs outputs"]) -> Float
 
 
 def over_bands(bands: Sequence[PredictionBand]) -> float | None:
-    """Rms error of several runs over the rms of their prediction bands; None where these diverge."""
+    """Rms error of several runs over the rms of their prediction bands; None where these are wider than the measured
+    motion about its mean, so that they say nothing."""
     allowed = np.concatenate([band.std_measured[band.run.counts] ** 2 for band in bands])
     seen = np.concatenate([band.run.squared_error for band in bands])
-    ratio = np.sqrt(np.sum(seen) / np.sum(allowed))
-    return float(ratio) if np.isfinite(allowed).all() else None
+    measured = [band.run.measured[band.run.counts] for band in bands]
+    moves = np.concatenate([own - np.mean(own) for own in measured if own.size])
+    # Also where a band is not finite.
+    return float(np.sqrt(np.sum(seen) / np.sum(allowed))) if np.sum(allowed) <= np.sum(moves**2) else None

@@ -117,7 +117,9 @@ class _LuGre(Effect):
         return 1.0 + self.excess * exponential(-((self.rate_of(motion) / self.omega_s) ** 2))
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
-        return _bent(self.bend, None if motion is None else self.rate_of(motion))
+        if motion is None:
+            return _bent(self.bend, None)
+        return _bent(self.bend * self._level(motion), self.rate_of(motion))
 
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
         limit = self.bend * self._level(motion)
@@ -178,5 +180,5 @@ def _bends(rate: float, scales: Scales) -> tuple[float, ...]:
 
 
 def _bent(bend: Array, rate: Array | None) -> Float[Array, "1"]:
-    """Bristles of a shaft in steady rotation are bent in its direction."""
+    """Bristles of a shaft in steady rotation are bent in its direction, to where they slide."""
     return (jnp.zeros_like(bend) if rate is None else bend * jnp.sign(rate))[None]

@@ -118,6 +118,16 @@ def test_conclusion_follows_from_names_excess_and_free_runs(change: dict, outcom
     assert conclude(replace(FINAL, excess_at_first=(1.0, 9.0), **change))[0] == outcome
 
 
+def test_evidence_against_replaced_names_gives_the_same_decision():
+    """A learned term replaced names that do not explain free runs."""
+    final = replace(FINAL, surprise=2.0, free_runs_explained=0.5, replaced=True)
+    told = decide(replace(CASE, final=final))
+    assert (told.outcome, told.names, told.lacking) == ("unexplained", (), None)
+    assert {c.rule for c in told.checks if not c.holds} >= {"surprise", "free_run_explained"}
+    lenient = decide(replace(CASE, final=final), replace(RULES, surprise=3.0))
+    assert (lenient.outcome, lenient.names) == ("effect_found", FINAL.names)
+
+
 def test_stored_evidence_gives_the_same_decision():
     again = case_evidence(json.loads(json.dumps(stored_evidence(CASE))))
     assert decide(again) == decide(CASE)

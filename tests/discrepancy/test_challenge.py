@@ -18,6 +18,7 @@ from fitting.discrepancy.learn import Unknown
 from fitting.discrepancy.variable_selection import Candidate
 from fitting.estimation.experiment import split
 from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.measurement_noise import measurement_noise
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
@@ -216,6 +217,35 @@ def test_names_without_strength_beside_a_learned_term_are_dropped(
     # The states of dropped effects are removed with them; creep has one.
     assert beside.states.shape == beside.push.shape == (2, 3 if "creep" in left else 2)
     assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)
+
+
+def test_share_of_a_replacing_term_is_that_of_the_names_that_are_left(base: Trial, monkeypatch: pytest.MonkeyPatch):
+    """One of two names is dropped beside a learned term, after a term in their place was learned."""
+    with_effects = functools.partial(_with_effects, base)
+    names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
+    named, bare = with_effects(*names, objective=-5.0), with_effects(TorqueBias(), objective=-5.0)
+    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
+    motion = np.zeros((2, 2))
+    instead, beside = (
+        Unknown(before, trial, (), chosen, np.arange(2), motion, Conditions(time=jnp.zeros(2)), motion, 2.0, 0.005)
+        for before, trial in (
+            (base, with_effects(LEARNED, objective=-6.0)),
+            (named, with_effects(*names, LEARNED, objective=-7.0)),
+        )
+    )
+    monkeypatch.setattr(module, "_learned", lambda standing, _: instead if standing.before is base else beside)
+    monkeypatch.setattr(module, "_without_learned", lambda *_: None)
+    monkeypatch.setattr(module, "_without_superfluous", lambda *_: (bare, replace(beside, before=bare)))
+    monkeypatch.setattr(module, "share_of", lambda model, *_: 0.1 * len(model.effects))
+    monkeypatch.setattr(module, "long_errors", lambda *_: None)
+    monkeypatch.setattr(module, "nonzero_effects", lambda fit, names: names)
+    monkeypatch.setattr(module, "leaves_imperfection", lambda _, __, noise: (False, noise))
+    monkeypatch.setattr(module, "leaves_white_noise", lambda _: False)
+    monkeypatch.setattr(module.Standing, "left", None)
+    study = Study({}, Setting(Segmentation(32)))
+    seen = module.challenge_names(base, named, study, noise=measurement_noise(base.training)).seen
+    assert seen.asked == ("instead", "beside") and seen.names == 1
+    assert seen.come_out == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(("objective", "superfluous"), [(-7.0, True), (-6.91, True), (-6.8, False), (-5.0, False)])

@@ -134,8 +134,27 @@ def test_unexplained_residual_is_reported_with_its_dependence(loop: Loop):
     assert f"depends most on the {left['depends_on']}" in found["summary"]
 
 
+def _with_surprise(loop: Loop, beyond: float | None, **changes) -> Loop:
+    """A loop with another error of free runs over their bands; None where these say nothing."""
+    final = dataclasses.replace(loop.case.final, surprise=beyond, wide_bands=beyond is None)
+    return Loop(**{**vars(loop), "case": dataclasses.replace(loop.case, final=final), "surprise": beyond, **changes})
+
+
+def test_bands_that_say_nothing_are_noted(loop: Loop):
+    for beyond in (None, 1.1):
+        notes = report_dict(_with_surprise(loop, beyond))["cannot_tell"]
+        assert any("bands are wider than the measured dynamic error itself" in n for n in notes) == (beyond is None)
+
+
+def test_free_runs_that_diverge_are_told_where_the_decision_is_unexplained(loop: Loop):
+    found = report_dict(_with_surprise(loop, np.inf, decision="unexplained"))
+    assert found["free_runs_times_expected"] is None
+    assert "Short segments hardly show it" in found["summary"]
+    assert "Free runs diverge: K" in found["before"]["parameters"]["K"]["note"]
+
+
 def test_unexplained_error_of_free_runs_is_reported(loop: Loop):
-    found = report_dict(Loop(**{**vars(loop), "decision": "unexplained", "surprise": 1.4}))
+    found = report_dict(_with_surprise(loop, 1.4, decision="unexplained"))
     assert found["free_runs_times_expected"] == 1.4
     assert "A part was found" in found["summary"]
     assert "1.40 times what noise and uncertainty allow" in found["summary"]
@@ -144,7 +163,7 @@ def test_unexplained_error_of_free_runs_is_reported(loop: Loop):
 
 @pytest.mark.parametrize(("beyond", "remains"), [(None, False), (1.1, False), (1.4, True)])
 def test_free_runs_beyond_their_bands_are_reported_beside_an_effect(loop: Loop, beyond: float | None, remains: bool):
-    found = report_dict(Loop(**{**vars(loop), "surprise": beyond}))
+    found = report_dict(_with_surprise(loop, beyond))
     assert found["unknown_remains"] == remains
     assert ("Something unknown is also missing: free runs along selection data err by" in found["summary"]) == remains
     assert (found["after"]["parameters"]["K"]["flag"] == "not covered") == remains

@@ -1,6 +1,7 @@
 """Sentences, units and rounded numbers in reports."""
 
 import math
+import sys
 from typing import Any, Literal
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 from fitting import formatting
 from fitting.attribution.decisions import tie
 from fitting.report import separating_experiment
+from fitting.report.fit_text import rounded
 from fitting.report.intervals import is_withheld, say_what_intervals_hold
 from fitting.report.rules import rules_dict
-from fitting.report.summary import _change, _remembering
+from fitting.report.summary import _change, _remembering, gain
 from fitting.report.tables import parameter_rows
 from hdjax.effects import FAMILIES
 
@@ -126,6 +128,23 @@ def test_summary_claims_no_change_where_free_runs_diverge_before_and_after():
     assert said == "It explains short segments alone: free runs along test data diverge before and after."
 
 
+def test_values_are_rounded_to_the_second_digit_of_their_error():
+    assert rounded([2113436.0, None], 4.5e5) == ["2110000", "n/a"]
+    assert rounded([0.07614634681, 0.0761463485], 8.6e-10) == ["0.07614634681", "0.07614634850"]
+
+
+@pytest.mark.parametrize(
+    ("share", "said"),
+    [
+        (0.5, "with it the error of free runs on selection data is 50 % smaller than without"),
+        (1.0, "free runs on selection data diverge without it, but not with it"),
+        (None, "free runs on selection data diverge with it"),
+    ],
+)
+def test_gain_is_told_in_words(share: float | None, said: str):
+    assert gain({"gain": share}) == said
+
+
 @pytest.mark.parametrize(
     ("memory", "said"),
     [
@@ -154,6 +173,7 @@ def _report_with_errors(
         ("effect_found", 1.1, None, False, False),
         ("effect_found", 2.7, 1.0, False, True),
         ("effect_found", 1.1, 4.0, False, True),
+        ("effect_found", 1.1, sys.float_info.max, False, True),
         ("unexplained", 44.0, None, True, True),
         ("unexplained", 1.1, None, False, True),
     ],
@@ -173,7 +193,10 @@ def _uncertain_report(
     decision: str, unknown: dict[str, str] | None, times_noise: float, beyond: float | None = None
 ) -> dict[str, Any]:
     accounts = {"before": _account(), "after": _account()}
-    known = {"times_noise": times_noise, "free_runs_times_expected": beyond}
+    # Infinity, which the evidence keeps as the largest number.
+    told = None if beyond == sys.float_info.max else beyond
+    evidence = {"final": {"surprise": beyond, "replaced": False}}
+    known = {"times_noise": times_noise, "free_runs_times_expected": told, "evidence": evidence}
     return {"decision": decision, "unknown": unknown, "parameters_from": "torque"} | known | accounts
 
 

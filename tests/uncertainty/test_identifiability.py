@@ -20,6 +20,8 @@ from fitting.uncertainty.identifiability import (
 )
 from fitting.uncertainty.standard_errors import Estimate, uncertainty
 from hdjax.effects.hysteresis import BoucWen
+from hdjax.effects.learned import LearnedMeshTorque
+from hdjax.effects.learned_axes import LinearAxis
 from hdjax.parameters import ParameterInfo
 
 COUNT, HORIZON, NOISE = 1000, 128, 2e-3
@@ -95,6 +97,47 @@ def test_slow_log_determines_only_ratios_to_the_squared_natural_frequency():
     assert weak.sentence is not None
     assert "do not separate mu, omega_0 and gain" in weak.sentence
     assert re.search(r"They determine mu omega_0\^-2(\.1)? and gain omega_0\^-2, but no factor alone", weak.sentence)
+
+
+@pytest.mark.parametrize(
+    ("weak", "told"),
+    [
+        ([(1.0, -1.0, 0.0, 0.0)], ["do not separate mu and omega_0: mu by"]),
+        (
+            [(1.0, -1.0, 0.0, 0.0), (0.0, 1.0, -1.0, 0.0)],
+            ["do not separate mu, omega_0 and alpha: 2 combinations of them are not determined."],
+        ),
+        ([(1.0, 1.0, 1.0, -1.0)], ["do not separate mu, omega_0, alpha and gain: one combination of them is not"]),
+        (
+            [(1.0, -1.0, 0.0, 0.0), (0.0, 0.0, 2.0, -1.0)],
+            ["separate alpha and gain: alpha by", "separate mu and omega"],
+        ),
+    ],
+)
+def test_weak_directions_of_the_same_parameters_are_told_together(
+    small_twist_fit: tuple[Fit, Estimate], weak: list[tuple[float, ...]], told: list[str]
+):
+    found = small_twist_fit[0]
+    covariance = 1e-6 * np.eye(4) + sum(np.outer(axis, axis) for axis in weak)
+    given = eqx.tree_at(lambda u: u.covariance, uncertainty(found), covariance)
+    sentences = [d.sentence for d in identifiability(found, given).directions if d.sentence is not None]
+    assert len(sentences) == len(told)
+    assert all(part in sentence for part, sentence in zip(told, sentences, strict=True)), sentences
+
+
+def test_coefficients_of_a_learned_function_are_not_named():
+    """Where all are fitted, a named parameter has the error that the whole covariance gives it."""
+    variables, start = (LinearAxis("x"), LinearAxis("v")), rig.reduced_model()
+    model = start.with_effects(LearnedMeshTorque.made_of(variables, np.ones((1, 1)), [0.0]))
+    stretches = [Stretch(rig.reduced_experiment(COUNT, noise=NOISE), 0, COUNT)]
+    paths = ("mu", "omega_0", "gain", "learned_mesh_torque.c_0")
+    found = fit(model, stretches, paths, Segmentation(HORIZON, substeps=2, count=8))
+    known = uncertainty(found)
+    result = identifiability(found, known)
+    axes = [np.array(list(d.weights.values())) for d in result.directions]
+    covariance = sum(d.std**2 * np.outer(axis, axis) for d, axis in zip(result.directions, axes, strict=True))
+    assert [list(d.weights) for d in result.directions] == [list(paths[:3])] * 3
+    assert covariance == pytest.approx(known.covariance[:3, :3], rel=1e-6, abs=1e-12)
 
 
 @pytest.fixture(scope="module")

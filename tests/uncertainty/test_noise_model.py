@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal
 import rig
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.rules import RULES
-from fitting.attribution.support import Standing, is_noise, noise_of_torque
+from fitting.attribution.support import Standing, is_noise, noise_of_torque, shows_noise
 from fitting.estimation.engines import with_engine
 from fitting.estimation.estimate import Fit, Start, fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, whole
@@ -122,13 +122,17 @@ def test_sensors_without_noise_have_no_noise_model():
 
 @pytest.mark.parametrize("correlation, std", [(0.8, 0.0), (0.98, 0.0), (0.8, STD), (0.98, STD)])
 def test_sensor_noise_is_estimated_with_its_memory_and_size(correlation: float, std: float):
-    found = noise_model_of(fitted(noisy_experiment(correlation=correlation, std=std, count=8000)))
+    drive = fitted(noisy_experiment(correlation=correlation, std=std, count=8000))
+    found = noise_model_of(drive)
     assert is_noise(found)
     memory = found.sensors.memory(rig.STEP)
     assert memory is not None and memory == pytest.approx(-rig.STEP / np.log(correlation), rel=0.4)
     # Number of white samples with the same information as the samples that are used.
     counts = 12 * 128 * (1.0 - correlation) / (1.0 + correlation)
     assert found.sensors.covariance[-1, -1] ** 0.5 == pytest.approx(TWIST, rel=3.0 / np.sqrt(2.0 * counts))
+    assert shows_noise(found, drive)
+    # Noise of which a chaotic motion lets the filter see only the increments.
+    assert not shows_noise(replace(found, sensors=replace(found.sensors, slow=100.0 * found.sensors.slow)), drive)
     torque = noise_of_torque(found)
     assert torque is None if std == 0.0 else torque == pytest.approx(std, rel=0.1)
 

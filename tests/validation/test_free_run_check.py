@@ -18,13 +18,14 @@ from fitting.uncertainty.prediction_band import PredictionBand
 from fitting.validation.account import Account, account
 from fitting.validation.free_run_check import over_bands, share_explained, surprise
 
-NOISE = 1e-6
+NOISE, SWING = 1e-6, 1e3
 PATHS = ("mu", "omega_0", "alpha", "gain")
 
 
 def run(times_noise: float, weight: np.ndarray | None = None, count: int = 50) -> FreeRun:
-    """A free run with the same error at every sample."""
-    return FreeRun("log", np.arange(count) * 1e-3, np.zeros(count), np.full(count, times_noise * NOISE), None, weight)
+    """A free run with the same error at every sample, of a motion a thousand times the noise."""
+    measured = SWING * NOISE * (-1.0) ** np.arange(count)
+    return FreeRun("log", np.arange(count) * 1e-3, measured - times_noise * NOISE, measured, None, weight)
 
 
 def band(of: FreeRun, std_parameters: float = 0.0, std_state: float = 0.0) -> PredictionBand:
@@ -49,8 +50,8 @@ def fitted() -> tuple[Fit, Account]:
         ([band(run(3.0))], 3.0),
         # Squares count, over all stretches.
         ([band(run(1.0)), band(run(7.0), std_parameters=7.0)], np.sqrt(50.0 / 51.0)),
-        # The band of a chaotic motion is huge.
-        ([band(run(100.0), std_state=1e4)], 0.01),
+        # The band of a chaotic motion is large.
+        ([band(run(5.0), std_state=0.5 * SWING)], 0.01),
     ],
 )
 def test_error_over_band_is_that_of_the_squares_over_all_stretches(bands: list[PredictionBand], expected: float):
@@ -64,8 +65,15 @@ def test_invalid_samples_do_not_count_in_error_over_band():
     assert over_bands([band(odd)]) == pytest.approx(1.0)
 
 
-def test_error_over_band_is_none_for_an_infinite_band():
-    assert over_bands([band(run(9.0), std_state=np.inf), band(run(9.0))]) is None
+@pytest.mark.parametrize("std", [2.0 * SWING, np.inf, np.nan])
+def test_error_over_a_band_wider_than_the_motion_is_none(std: float):
+    assert over_bands([band(run(9.0), std_state=std), band(run(9.0))]) is None
+    # Its mean, by which a constant would predict it as well, does not count.
+    assert over_bands([band(replace(run(9.0), measured=np.full(50, 1.0)), std_state=9.0)]) is None
+
+
+def test_error_of_runs_that_diverge_is_infinite():
+    assert over_bands([band(run(np.inf)), band(run(1.0))]) == np.inf
 
 
 @pytest.mark.parametrize(
