@@ -174,6 +174,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
             is_output = outputs_until is not None and signal in (*required[:-1], *OUTPUTS)
             column = _cut(raw[signal], start, stop, start + outputs_until if is_output and outputs_until else stop)
             channels[signal] = channel(path, drive_file, signal, column, first_row=start)
+    channels = _without_empty_rows(channels, required[-1])
     base = _time(path, drive_file, table, kind, raw.get("time"), channels, slice(start, stop))
     if len(base.time) < SHORTEST:
         raise DataError(f"{path}: only {len(base.time)} rows have a valid stamp; a fit needs {SHORTEST}")
@@ -219,6 +220,23 @@ def _put_together(
     for name, values in zip(("motor_angle", "load_angle"), angles, strict=True):
         signals[name] = np.concatenate([values, signals[name][len(values) :]])
     return moved
+
+
+def _without_empty_rows(channels: dict[str, Channel], driven_by: str) -> dict[str, Channel]:
+    """The channels, without the input's zeros where a sensor dropped out and the others are zero: the row is empty."""
+    motion = [found for name, found in channels.items() if name.endswith(("_angle", "_velocity"))]
+    empty = channels[driven_by].values == 0.0
+    for found in motion:
+        dropped = np.isin(np.arange(len(empty)), found.dropouts)
+        empty &= dropped | (found.values == 0.0)
+    empty &= np.isin(np.arange(len(empty)), [row for found in motion for row in found.dropouts])
+    if not empty.any():
+        return channels
+    source = channels[driven_by]
+    what = f"{empty.sum()} rows are zero throughout"
+    finding = Finding("warning", what, driven_by, "it counts as unknown there")
+    values = np.where(empty, np.nan, source.values)
+    return channels | {driven_by: replace(source, values=values, findings=(*source.findings, finding))}
 
 
 def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], outputs: Sequence[str], start: int) -> int | None:
