@@ -138,6 +138,14 @@ def test_rounded_stamps_with_pause_and_missing_samples_are_reconstructed():
     assert np.diff(found.time)[1995] == pytest.approx(0.25 + STEP, abs=2e-3)
 
 
+def test_single_precision_stamps_that_step_by_their_last_digit_are_reconstructed_beside_a_pause():
+    """The last digit is just below the sampling interval, so that some steps are of two."""
+    kept = np.delete(np.arange(COUNT), np.arange(3000, 3010))
+    found = time_base_of((CLOCK + 5000).astype("f4").astype(float)[kept], SAMPLES[kept])
+    assert_one_finding(found, "note", "rounded", "steady sampling")
+    np.testing.assert_allclose(np.delete(np.diff(found.time), 2999), STEP, rtol=1e-4)
+
+
 def test_missing_samples_of_an_exact_clock_are_not_detected_as_rounding():
     kept = np.delete(np.arange(COUNT), [100, 101, 700, 1500, 2000, 2900, 3100])
     found = time_base_of(CLOCK[kept], SAMPLES[kept])
