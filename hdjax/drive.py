@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hdjax.parameters import Scalar, parameter
+from hdjax.parameters import Scalar, parameter, refuse_unphysical
 
 SEED = "seed document, Table 1"
 
@@ -42,6 +42,9 @@ class Drive(eqx.Module):
         1.0, unit="1", doc="motor torque over the torque as logged", source="one where it is right", bounds=(0.0, 1e9)
     )
     priors: tuple[Prior, ...] = eqx.field(static=True, default=(), kw_only=True)
+
+    def __check_init__(self):
+        refuse_unphysical(self)
 
     @property
     def c(self) -> Scalar:
@@ -90,6 +93,9 @@ class ReducedDrive(eqx.Module):
     omega_0: Scalar = parameter(unit="rad/s", doc="natural frequency", source="DESIGN eq. 2.1", bounds=(0.0, 1e9))
     alpha: Scalar = parameter(0.0, unit="1/[x]^2", doc="cubic stiffness coefficient", source="DESIGN eq. 2.1")
     gain: Scalar = parameter(1.0, unit="[x]/s^2/[u]", doc="acceleration per unit of forcing", source="DESIGN eq. 2.1")
+
+    def __check_init__(self):
+        refuse_unphysical(self)
 
     @property
     def c(self) -> float:
