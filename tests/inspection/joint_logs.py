@@ -380,6 +380,19 @@ SHAPES: dict[str, Shape] = {
         joint="2",
         time="time_train",
     ),
+    "MATLAB's iddata": Shape(
+        lambda s: {
+            "t": s.time,
+            "z.InputData": s.motor_torque,
+            "z.OutputData(:,1)": s.motor_angle,
+            "z.OutputData(:,2)": s.load_angle,
+        },
+        {
+            "z.InputData": ("motor_torque", None, 1),
+            "z.OutputData(:,1)": ("motor_angle", "rad", 1),
+            "z.OutputData(:,2)": ("load_angle", "rad", 1),
+        },
+    ),
     "nothing that is a drive": Shape(
         lambda s: {f"sensor{k}": _smooth(k, s.time.size) for k in range(4)} | {"humidity": _smooth(7, s.time.size)},
         {},
