@@ -49,7 +49,8 @@ def in_context(columns: Sequence[Column]) -> tuple[NameSense, ...]:
     """Meaning of the names, each in context of the others.
 
     In a robot's log `theta` is the motor's angle where `q` is the link's, and so are their rates. In a system's log `u`
-    is the input and `y` the output (in MATLAB's `iddata` `InputData` and `OutputData`): of a joint its torque and angle.
+    is the input and `y` the output: of a joint its torque and angle. MATLAB's `iddata` calls them `InputData` and
+    `OutputData`.
     """
     leaves = [column.sense.stem.rpartition(".")[2] for column in columns]
     robot = any("theta" in leaf for leaf in leaves) and "q" in leaves

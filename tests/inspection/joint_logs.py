@@ -380,6 +380,21 @@ SHAPES: dict[str, Shape] = {
         joint="2",
         time="time_train",
     ),
+    "seconds and nanoseconds without telling names": Shape(
+        lambda s: {
+            "stamp": 1.7e9 + np.floor(s.time + 0.3),
+            "stamp2": np.rint(np.mod(s.time + 0.3, 1.0) * 1e9),
+            "motor_pos": s.motor_angle,
+            "link_pos": s.load_angle,
+            "torque": s.motor_torque,
+        },
+        {
+            "motor_pos": ("motor_angle", "rad", 1),
+            "link_pos": ("load_angle", "rad", 1),
+            "torque": ("motor_torque", None, 1),
+        },
+        time="stamp",
+    ),
     "MATLAB's iddata": Shape(
         lambda s: {
             "t": s.time,
