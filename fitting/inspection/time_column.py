@@ -74,7 +74,8 @@ def guess_time(table: Table) -> TimeGuess:
     if any(column.time is not None for column in table.columns):
         return TimeGuess(None, "s", 1.0, ("each channel has separate stamps",))
     # Of several equal time columns, the first represents all.
-    scored = [(_log_odds(column), column) for column in table.columns if _first_name(column.name, table) is None]
+    named = [column for column in table.columns if _first_name(column.name, table) is None]
+    scored = [(_log_odds(column, _is_repeated(column, table)), column) for column in named]
     score, column = max(scored, key=lambda pair: pair[0], default=(-np.inf, None))
     pair = _pair(table, column)
     if pair is not None:
@@ -208,8 +209,14 @@ def _rising(values: np.ndarray) -> tuple[float, float, float]:
     return float(np.mean(step > 0)), float(np.mean(step < 0)), float((high - low) / np.median(up))
 
 
-def _log_odds(column: Column) -> float:
-    """Log odds that the column is the clock."""
+def _is_repeated(column: Column, table: Table) -> bool:
+    """Whether later columns have the name and the values of this one."""
+    later = (other for other in table.columns if _first_name(other.name, table) == column.name)
+    return any(np.array_equal(column.values, other.values, equal_nan=True) for other in later)
+
+
+def _log_odds(column: Column, repeated: bool) -> float:
+    """Log odds that the column is the clock; one that is repeated may be called anything."""
     known = np.isfinite(column.values)
     if known.mean() < 1.0 - 0.2 or column.constant:
         return -np.inf
@@ -218,6 +225,8 @@ def _log_odds(column: Column) -> float:
         return -np.inf
     said = column.sense.quantities
     counts = said[:1] == ("counter",)
+    if repeated and "time" not in said and not counts:
+        said = ()
     name = _NAMED if said == ("time",) else _MAYBE if "time" in said else _OTHERWISE if said else _ANONYMOUS
     unit = 0.0
     if _stated(column) or _since(column.values):

@@ -395,6 +395,22 @@ SHAPES: dict[str, Shape] = {
         },
         time="stamp",
     ),
+    "a scope that calls each clock Name": Shape(
+        lambda s: {
+            "Name": s.time * 1e3,
+            "Axis1.ActPos": s.motor_angle,
+            "Name (2)": s.time * 1e3,
+            "Axis1.ActTorque": s.motor_torque,
+            "Name (3)": s.time * 1e3,
+            "Load.Pos": s.load_angle,
+        },
+        {
+            "Axis1.ActPos": ("motor_angle", "rad", 1),
+            "Load.Pos": ("load_angle", "rad", 1),
+            "Axis1.ActTorque": ("motor_torque", None, 1),
+        },
+        time="Name",
+    ),
     "MATLAB's iddata": Shape(
         lambda s: {
             "t": s.time,
