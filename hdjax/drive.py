@@ -80,7 +80,9 @@ class Drive(eqx.Module):
 
     def reduced(self) -> "ReducedDrive":
         """The equation of this drive's dynamic error, forced by the motor torque."""
-        return ReducedDrive(mu=self.mu, omega_0=self.omega_0, alpha=self.alpha, gain=self.k_T / (self.N * self.J_m))
+        values = self.mu, self.omega_0, self.alpha, self.k_T / (self.N * self.J_m)
+        # A spring that has softened altogether is no reason to refuse: the values are put in afterwards.
+        return eqx.tree_at(lambda d: (d.mu, d.omega_0, d.alpha, d.gain), ReducedDrive(mu=0.0, omega_0=1.0), values)
 
 
 class ReducedDrive(eqx.Module):
