@@ -3,20 +3,21 @@
 import math
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 
-def write_whole(contents: Mapping[Path, str | bytes]) -> None:
+def write_whole(contents: Mapping[Path, str | bytes], *, older: Iterable[Path] = ()) -> None:
     """Write several files so that either all are complete or none is changed.
 
     Each is first written to a temporary file beside its destination; all are renamed when complete.
 
     Args:
         contents: text or bytes by path; missing folders are created.
+        older: files that an earlier run may have left; those that are not written are then removed.
     """
     waiting: list[tuple[str, Path]] = []
     try:
@@ -32,6 +33,8 @@ def write_whole(contents: Mapping[Path, str | bytes]) -> None:
             name, path = waiting[0]
             os.replace(name, path)
             waiting.pop(0)
+        for path in set(older) - set(contents):
+            path.unlink(missing_ok=True)
     finally:
         for name, _ in waiting:
             os.unlink(name)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hdjax.parameters import Scalar, parameter
+from hdjax.parameters import Scalar, parameter, refuse_unphysical
 
 SEED = "seed document, Table 1"
 
@@ -43,6 +43,9 @@ class Drive(eqx.Module):
     )
     priors: tuple[Prior, ...] = eqx.field(static=True, default=(), kw_only=True)
 
+    def __check_init__(self):
+        refuse_unphysical(self)
+
     @property
     def c(self) -> Scalar:
         """Inverse of the reduced inertia, `(N^2 J_m + J_l) / (N^2 J_m J_l)` [1/(kg m^2)]."""
@@ -77,7 +80,9 @@ class Drive(eqx.Module):
 
     def reduced(self) -> "ReducedDrive":
         """The equation of this drive's dynamic error, forced by the motor torque."""
-        return ReducedDrive(mu=self.mu, omega_0=self.omega_0, alpha=self.alpha, gain=self.k_T / (self.N * self.J_m))
+        values = self.mu, self.omega_0, self.alpha, self.k_T / (self.N * self.J_m)
+        # A spring that has softened altogether is no reason to refuse: the values are put in afterwards.
+        return eqx.tree_at(lambda d: (d.mu, d.omega_0, d.alpha, d.gain), ReducedDrive(mu=0.0, omega_0=1.0), values)
 
 
 class ReducedDrive(eqx.Module):
@@ -90,6 +95,9 @@ class ReducedDrive(eqx.Module):
     omega_0: Scalar = parameter(unit="rad/s", doc="natural frequency", source="DESIGN eq. 2.1", bounds=(0.0, 1e9))
     alpha: Scalar = parameter(0.0, unit="1/[x]^2", doc="cubic stiffness coefficient", source="DESIGN eq. 2.1")
     gain: Scalar = parameter(1.0, unit="[x]/s^2/[u]", doc="acceleration per unit of forcing", source="DESIGN eq. 2.1")
+
+    def __check_init__(self):
+        refuse_unphysical(self)
 
     @property
     def c(self) -> float:

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
@@ -116,3 +117,19 @@ def own_value(module: eqx.Module, name: str) -> Any:
         return getattr(module, name)
     stem, _, index = name.rpartition("_")
     return getattr(module, stem)[int(index)]
+
+
+def refuse_unphysical(module: eqx.Module) -> None:
+    """Refuse parameters that no drive has; tracers of JAX have no value yet, and pass.
+
+    Args:
+        module: with numbers for parameters.
+
+    Raises:
+        ValueError: A parameter is not above its lower bound, or no finite number.
+    """
+    for name, info in own_parameters(module):
+        value, low = own_value(module, name), info.bounds[0]
+        if not isinstance(value, Tracer) and not np.all((np.asarray(value) > low) & np.isfinite(value)):
+            range_ = "a finite number" if math.isinf(low) else f"above {low:g} {info.unit}"
+            raise ValueError(f"`{name}` must be {range_}, but is {value}")

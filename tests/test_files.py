@@ -29,6 +29,14 @@ def test_existing_file_is_replaced(tmp_path: Path):
     assert contents(tmp_path) == {"report.json": "new"}
 
 
+def test_files_of_an_earlier_run_are_removed(tmp_path: Path):
+    for name in ("report.json", "plot.png", "notes.txt"):
+        (tmp_path / name).write_text("old", encoding="utf-8")
+    older = [tmp_path / name for name in ("report.json", "plot.png", "absent.csv")]
+    write_whole({tmp_path / "report.json": "new"}, older=older)
+    assert contents(tmp_path) == {"report.json": "new", "notes.txt": "old"}
+
+
 @pytest.mark.parametrize("failing", [1, 2])
 def test_failed_write_changes_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int):
     (tmp_path / "one.txt").write_text("old", encoding="utf-8")

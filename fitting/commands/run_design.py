@@ -49,7 +49,7 @@ def design_file(spec: Path, out: Path, *, plot: bool) -> None:
         from fitting.commands.design_plot import summary
 
         files[out / "design.png"] = summary(study, found, proof)
-    write_whole(files)
+    write_whole(files, older=[out / "design.png"])
     print(design_text(study, found, proof))
     show_files(files)
     if not found.best.feasible:

@@ -10,8 +10,10 @@ import numpy as np
 from fitting.errors import InputError
 from fitting.logs.channels import without_fill_values
 from fitting.logs.column_names import NameSense, sense
+from fitting.logs.dropouts import zero_dropouts
 from fitting.logs.raw_table import RawColumn, RawTable, split_unit
 from fitting.logs.read_table import read_table
+from fitting.logs.unwrapping import wrapping_spans
 
 _FEWEST_ROWS = 8
 _MOST_TEXT = 0.05  # largest share of rows with text or blanks for a channel
@@ -166,6 +168,8 @@ def _column(name: str, raw: RawColumn, plain: Sequence[str]) -> Column:
     said = sense(name)
     short = split_unit(name)[0]
     values, _ = without_fill_values(raw.values)
+    if {"angle", "velocity"} & set(said.quantities):
+        values[zero_dropouts(values, wrapping_spans(values, 360.0))] = np.nan
     return Column(
         name=short if plain.count(short) == 1 else name,
         unit=_plain_unit(raw.unit or said.unit),

@@ -38,7 +38,7 @@ def drive_tables(inspection: Inspection) -> dict[str, Any]:
         drive["reduction_ratio"] = _number(joint.ratio.value)
     columns = {s: _place(inspection, joint.signals[s]) for s in _written(inspection)}
     if inspection.time.column is not None:
-        columns = {"time": {"column": inspection.time.column, "unit": inspection.time.unit}} | columns
+        columns = {"time": _time_place(inspection)} | columns
     return {"drive": drive, "columns": columns}
 
 
@@ -198,11 +198,17 @@ def _sampling_lines(inspection: Inspection) -> list[str]:
     return [*lines, hold] if inspection.joint.kind != "quasi-static" else lines
 
 
+def _time_place(inspection: Inspection) -> dict[str, Any]:
+    time = inspection.time
+    fraction = {} if time.fraction is None else {"fraction": dict(zip(("column", "unit"), time.fraction, strict=True))}
+    return {"column": time.column, "unit": time.unit} | fraction
+
+
 def _time_lines(inspection: Inspection) -> list[str]:
     time = inspection.time
     if time.column is None:
         return [f"# time: {_plain('; '.join(time.reasons))}"]
-    place = {"column": time.column, "unit": time.unit}
+    place = _time_place(inspection)
     return [f"time = {_toml(place)}  # guess, {_percent(time.confidence)}: {_plain('; '.join(time.reasons))}"]
 
 

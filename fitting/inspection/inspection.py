@@ -238,7 +238,7 @@ def _unwrapped(column: Column) -> np.ndarray:
 def _joint(
     tables: Sequence[Table], clocks: Sequence[Clock], time: TimeGuess, label: str | None, labels: tuple[str, ...]
 ) -> JointInspection:
-    clocks_of = {time.column, *time.clocks.values()}
+    clocks_of = {time.column, *time.clocks.values(), *(time.fraction or ())}
     columns = [c for c in tables[0].columns if c.name not in clocks_of and _is_of(c, label, labels)]
     if not columns:
         return JointInspection(label, {}, {}, {}, None, 0.0)

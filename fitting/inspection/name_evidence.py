@@ -26,6 +26,8 @@ _UNNAMED: dict[str, float] = dict.fromkeys(
 _OF_THE_JOINT = -1.0  # a torque named after the joint that is the motor's
 _CONSTANT, _LOCKED = -5.0, -2.0  # a constant channel, or a constant angle: one side may be locked
 _BARE_TORQUE = {"motor_torque": 0.5, "joint_torque": -0.5, "load_torque": -2.5}  # a torque without a side
+# Inputs and outputs of a system.
+_SYSTEM = {"u": "u", "y": "y", "input_data": "u", "output_data": "y"}
 
 _SI = SI | {"motor_current": "A"}
 
@@ -47,18 +49,25 @@ def in_context(columns: Sequence[Column]) -> tuple[NameSense, ...]:
     """Meaning of the names, each in context of the others.
 
     In a robot's log `theta` is the motor's angle where `q` is the link's, and so are their rates. In a system's log `u`
-    is the input and `y` the output: of a joint its torque and angle.
+    is the input and `y` the output: of a joint its torque and angle. MATLAB's `iddata` calls them `InputData` and
+    `OutputData`.
     """
     leaves = [column.sense.stem.rpartition(".")[2] for column in columns]
     robot = any("theta" in leaf for leaf in leaves) and "q" in leaves
-    system = {"u", "y"} <= {leaf.partition("_")[0] for leaf in leaves}
-    return tuple(_beside(column.sense, leaf, robot, system) for column, leaf in zip(columns, leaves, strict=True))
+    roles = [_SYSTEM.get(leaf) or _SYSTEM.get(leaf.partition("_")[0]) for leaf in leaves]
+    roles = roles if {"u", "y"} <= set(roles) else [None] * len(roles)
+    # Several outputs are angles, those of one drive or of a robot's joints.
+    joints = any(role == "y" and column.sense.joint is not None for role, column in zip(roles, columns, strict=True))
+    return tuple(
+        _beside(column.sense, leaf, robot, role, joints)
+        for column, leaf, role in zip(columns, leaves, roles, strict=True)
+    )
 
 
-def _beside(sense: NameSense, leaf: str, robot: bool, system: bool) -> NameSense:
-    if system and sense.quantities[:1] in (("input",), ("twist",)) and leaf.partition("_")[0] in ("u", "y"):
-        of = ("input", "twist") if sense.joint is None else ("torque", "angle")
-        return replace(sense, quantities=of[:1] if leaf.startswith("u") else of[1:])
+def _beside(sense: NameSense, leaf: str, robot: bool, role: str | None, joints: bool) -> NameSense:
+    if role is not None and (leaf in _SYSTEM or sense.quantities[:1] in (("input",), ("twist",))):
+        of = ("torque", "angle") if joints else ("input", "twist")
+        return replace(sense, quantities=of[:1] if role == "u" else of[1:], side=None)
     if robot and sense.side is None and sense.quantities[:1] in (("angle",), ("velocity",)):
         side = "motor" if "theta" in leaf else "load" if leaf in ("q", "dq", "qd", "q_dot") else None
         return replace(sense, side=side)

@@ -1,7 +1,7 @@
 """The clock column of a log, and its unit."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,6 +30,7 @@ _DATED = (
 _EPOCHS = (0.9e9, 2.5e9)  # s since 1970, of the years 1998 to 2049
 _SLOWEST = 60.0  # s between samples, assumed: a drive moves faster
 _MOST_BACK = 0.01
+_NEARLY_ALL = 0.9  # of a second, which the largest part of one exceeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class TimeGuess:
         confidence: Of the column, 0 to 1.
         reasons: For both.
         unit_stated: Whether the file states the unit.
+        fraction: Column with the parts of a second, and their unit; None where the stamps are in one column.
         clocks: For a table with several time columns: the clock of each column with a later one, by name.
     """
 
@@ -51,6 +53,7 @@ class TimeGuess:
     reasons: tuple[str, ...]
     unit_stated: bool = True
     clocks: dict[str, str] = field(default_factory=dict)
+    fraction: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +74,14 @@ def guess_time(table: Table) -> TimeGuess:
     if any(column.time is not None for column in table.columns):
         return TimeGuess(None, "s", 1.0, ("each channel has separate stamps",))
     # Of several equal time columns, the first represents all.
-    scored = [(_log_odds(column), column) for column in table.columns if _first_name(column.name, table) is None]
+    named = [column for column in table.columns if _first_name(column.name, table) is None]
+    scored = [(_log_odds(column, _is_repeated(column, table)), column) for column in named]
     score, column = max(scored, key=lambda pair: pair[0], default=(-np.inf, None))
+    pair = _pair(table, column)
+    if pair is not None:
+        whole, part, unit = pair
+        why = f"whole seconds, which change where '{part}' begins anew"
+        return TimeGuess(whole, "s", 1.0, (why,), fraction=(part, unit))
     if column is None or score <= 0.0:
         why = "a sample rate is stored with the data" if table.sample_rate else "no column rises like a clock"
         return TimeGuess(None, "s", 1.0 if table.sample_rate else 0.0, (why,))
@@ -87,6 +96,32 @@ def guess_time(table: Table) -> TimeGuess:
     stated = _stated(column) is not None
     confidence = float(np.exp(min(score, 30.0)) / weights.sum())
     return TimeGuess(column.name, unit, confidence, (*reasons, why), stated, _clocks(table, column.name))
+
+
+def _pair(table: Table, column: Column | None) -> tuple[str, str, str] | None:
+    """A column of whole seconds, that of their parts, and the latter's unit; one of both is given."""
+    if column is None:
+        return None
+    for other in table.columns:
+        for whole, part in ((column, other), (other, column)):
+            unit = _unit_of_parts(whole.values, part.values) if whole is not part else None
+            if unit is not None:
+                return whole.name, part.name, unit
+    return None
+
+
+def _unit_of_parts(whole: np.ndarray, part: np.ndarray) -> str | None:
+    """Unit of the parts of whole seconds; None where the values are not."""
+    known = np.isfinite(whole) & np.isfinite(part) if len(whole) == len(part) else np.zeros(0, dtype=bool)
+    whole, part = whole[: len(known)][known], part[: len(known)][known]
+    if len(whole) < 2 or np.any(whole != np.rint(whole)) or part.min() < 0:
+        return None
+    seconds = np.diff(whole)
+    # Each second begins with a smaller part, which rises within it.
+    if not (seconds > 0).any() or np.any(seconds < 0) or np.any((np.diff(part) < 0) != (seconds > 0)):
+        return None
+    sizes = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+    return next((unit for unit, size in sizes.items() if _NEARLY_ALL * size < part.max() < size), None)
 
 
 def _first_name(name: str, table: Table) -> str | None:
@@ -117,9 +152,8 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
     """The stamps of a table by the guessed clock column."""
     rows = np.arange(table.rows)
     if guess.column is not None:
-        column = table.column(guess.column)
         try:
-            return Clock(_base(table, column, guess.unit), True)
+            return Clock(_base(table, guess), True)
         except InputError:
             pass
     step = 1.0 / table.sample_rate if table.sample_rate else 1.0
@@ -131,21 +165,29 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
     return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None)
 
 
-def _base(table: Table, column: Column, unit: str) -> TimeBase:
-    second = float(convert(np.array(1.0), unit, "s"))
+def _base(table: Table, guess: TimeGuess) -> TimeBase:
+    """The time base of a guess that has a column."""
+    assert guess.column is not None
+    column, second = table.column(guess.column), float(convert(np.array(1.0), guess.unit, "s"))
     others = [other.values for other in table.columns if other is not column]
+    if guess.fraction is not None:
+        part, unit = guess.fraction
+        parts = convert(table.column(part).values, unit, "s")
+        column = replace(column, values=column.values - np.nanmin(column.values) + parts)
     samples = np.stack(others or [np.arange(len(column.values))], axis=1)
     return time_base(
         column.values * second, samples, path=table.path, name=column.name, second=1.0 / second, first_row=0
     )
 
 
-def sampling_findings(table: Table, column: Column, unit: str) -> tuple[Finding, ...]:
+def sampling_findings(table: Table, guess: TimeGuess) -> tuple[Finding, ...]:
     """Corrections of the stamps, or why there are none."""
+    if guess.column is None:
+        return ()
     try:
-        return _base(table, column, unit).findings
+        return _base(table, guess).findings
     except InputError as error:
-        return (Finding("refusal", str(error).partition(": ")[2], column.name, "there is no time base"),)
+        return (Finding("refusal", str(error).partition(": ")[2], guess.column, "there is no time base"),)
 
 
 def _stated(column: Column) -> str | None:
@@ -167,8 +209,14 @@ def _rising(values: np.ndarray) -> tuple[float, float, float]:
     return float(np.mean(step > 0)), float(np.mean(step < 0)), float((high - low) / np.median(up))
 
 
-def _log_odds(column: Column) -> float:
-    """Log odds that the column is the clock."""
+def _is_repeated(column: Column, table: Table) -> bool:
+    """Whether later columns have the name and the values of this one."""
+    later = (other for other in table.columns if _first_name(other.name, table) == column.name)
+    return any(np.array_equal(column.values, other.values, equal_nan=True) for other in later)
+
+
+def _log_odds(column: Column, repeated: bool) -> float:
+    """Log odds that the column is the clock; one that is repeated may be called anything."""
     known = np.isfinite(column.values)
     if known.mean() < 1.0 - 0.2 or column.constant:
         return -np.inf
@@ -177,6 +225,8 @@ def _log_odds(column: Column) -> float:
         return -np.inf
     said = column.sense.quantities
     counts = said[:1] == ("counter",)
+    if repeated and "time" not in said and not counts:
+        said = ()
     name = _NAMED if said == ("time",) else _MAYBE if "time" in said else _OTHERWISE if said else _ANONYMOUS
     unit = 0.0
     if _stated(column) or _since(column.values):

@@ -10,6 +10,7 @@ import numpy as np
 
 from fitting.errors import InputError
 from fitting.logs.raw_table import RawColumn, RawTable, not_numbers
+from fitting.logs.units import UnitError, convert
 
 # Names of scalar sample rates beside the data in MATLAB and HDF5 files.
 _RATE_NAMES = ("fs", "Fs", "FS", "sample_rate", "sampling_rate", "sampling_frequency", "SampleRate")
@@ -246,5 +247,15 @@ def _rate(get: Callable[[str], Any]) -> float | None:
     for name in (*_RATE_NAMES, *_STEP_NAMES):
         array = np.asarray(get(name))
         if array.size == 1 and array.dtype.kind in "iuf" and 0 < array.item() < np.inf:
-            return float(array.item()) if name in _RATE_NAMES else 1.0 / float(array.item())
+            return (
+                float(array.item()) if name in _RATE_NAMES else 1.0 / (float(array.item()) * _second(get("TimeUnit")))
+            )
     return None
+
+
+def _second(unit: Any) -> float:
+    """A unit of time, as MATLAB spells it, in seconds; one where there is none."""
+    try:
+        return float(convert(np.array(1.0), str(unit), "s"))
+    except UnitError:
+        return 1.0

@@ -1,17 +1,18 @@
 """From a raw column to a signal in SI units: unit, sign, offset, blanks, wrapped counts."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from fitting.errors import InputError
 from fitting.logs.drive_file import ColumnMap, DriveFile
+from fitting.logs.dropouts import zero_dropouts
 from fitting.logs.findings import Finding
 from fitting.logs.raw_table import RawColumn
 from fitting.logs.units import UnitError, convert, to_base
-from fitting.logs.unwrapping import unwrapped_angle, unwrapped_overflow
+from fitting.logs.unwrapping import unwrapped_angle, unwrapped_overflow, wrapping_spans
 
 SI = {
     "time": "s",
@@ -39,11 +40,13 @@ class Channel:
         values: in `unit`, (n,), NaN where unknown.
         unit: SI, or that of the drive file for a reduced log.
         findings: on corrections.
+        dropouts: rows in which the sensor gave zero for want of a value.
     """
 
     values: np.ndarray
     unit: str
     findings: tuple[Finding, ...] = ()
+    dropouts: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
 
 
 def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *, first_row: int = 0) -> Channel:
@@ -69,11 +72,16 @@ def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *
         findings.append(Finding("warning", what, where, "they count as blank"))
     unit, disagreement = _unit(place, column, signal)
     findings += disagreement
+    values, dropouts = _without_dropouts(drive_file, signal, place, values, unit)
+    if len(dropouts):
+        where = f"{place.column}, first in data row {first_row + dropouts[0] + 1}"
+        what = f"{len(dropouts)} samples are exactly zero, far from those before and behind"
+        findings.append(Finding("warning", what, where, "they are dropouts, and count as blank"))
     values, wrapped = _unwrapped(drive_file, signal, place, values, unit, first_row)
     converted, name = _convert(drive_file, signal, place, (values - place.offset) * place.sign, unit)
     # The conversion may overflow or underflow.
     converted = np.where(np.abs(converted) < _FILL, converted, np.nan)
-    return Channel(converted, name, (*findings, *wrapped))
+    return Channel(converted, name, (*findings, *wrapped), dropouts)
 
 
 def without_fill_values(values: np.ndarray) -> tuple[np.ndarray, float | None]:
@@ -88,6 +96,25 @@ def without_fill_values(values: np.ndarray) -> tuple[np.ndarray, float | None]:
         if len(others) and 0 < np.ptp(others) < np.min(np.abs(others - level)):
             return np.where(values == level, np.nan, values), float(level)
     return values, None
+
+
+def _without_dropouts(
+    drive_file: DriveFile, signal: str, place: ColumnMap, values: np.ndarray, unit: str | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The values of an angle or velocity, NaN where the sensor dropped out; and the rows of these."""
+    if not signal.endswith(("_angle", "_velocity")):
+        return values, np.zeros(0, dtype=int)
+    spans = wrapping_spans(values, _revolution(drive_file, signal, place, unit)) if signal.endswith("_angle") else []
+    rows = zero_dropouts(values, spans)
+    values = values.copy()
+    values[rows] = np.nan
+    return values, rows
+
+
+def _revolution(drive_file: DriveFile, signal: str, place: ColumnMap, unit: str | None) -> float:
+    """A revolution in the column's unit; infinite where it has none."""
+    radian = float(_convert(drive_file, signal, place, np.array(1.0), unit)[0])
+    return 2 * np.pi / abs(radian) if radian else np.inf
 
 
 def _text(path: Path, name: str, column: RawColumn, first_row: int) -> Sequence[Finding]:
@@ -124,8 +151,7 @@ def _unwrapped(
     if np.isfinite(values).sum() < 3:
         return values, ()
     if signal in ("motor_angle", "load_angle"):
-        radian = float(_convert(drive_file, signal, place, np.array(1.0), unit)[0])
-        found, span, rows = unwrapped_angle(values, 2 * np.pi / abs(radian) if radian else np.inf)
+        found, span, rows = unwrapped_angle(values, _revolution(drive_file, signal, place, unit))
         severity, what = "note", "wraps"
     elif signal in ("motor_torque", "load_torque", "forcing"):
         found, span, rows = unwrapped_overflow(values)

@@ -120,7 +120,7 @@ def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     for name in inputs:
         values = _known(log, name)
         if values is not None and not _is_constant(values):
-            yield from _inputs(name, values, log.time)
+            yield from _inputs(name, values, log.time, log.input_known if name == _INPUTS[log.kind] else None)
             yield from _quantised(log, name, values, 1.0, float(np.std(values)))
     if log.dynamic_error is None or log.kind != "drive":
         for name in log.outputs:
@@ -138,8 +138,8 @@ def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
         yield from _quantised(log, name, values, side, spread)
 
 
-def _inputs(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
-    """Findings on an input, which the fit uses as logged."""
+def _inputs(name: str, values: np.ndarray, time: np.ndarray, known: np.ndarray | None) -> Iterator[Finding]:
+    """Findings on an input, which the fit uses as logged where it is known (None for all rows)."""
     for rows, level, count in clipped(values, None):
         yield Finding(
             "warning",
@@ -148,6 +148,7 @@ def _inputs(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Finding
             "the channel looks clipped, which biases stiffness and damping unless the drive was at its limit",
         )
     spikes = glitches(values, time)
+    spikes = spikes if known is None else spikes[known[spikes]]
     if len(spikes):
         yield Finding(
             "note",

@@ -38,6 +38,7 @@ from fitting.logs.split_stamps import partners, with_joined_stamps
 from fitting.logs.time_stamps import TimeBase
 
 _SLOWEST = 60.0  # s between samples; too slow for a drive's resonance, so that the unit of time must be wrong
+_SAME_RATE, _OFF_RATE = 0.001, 0.1  # relative differences of sample rates, assumed
 _AS_LOGGED = (
     *("motor_angle", "load_angle", "motor_torque", "load_torque", "joint_torque"),
     *("motor_velocity", "load_velocity", "temperature", "forcing"),
@@ -174,6 +175,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
             is_output = outputs_until is not None and signal in (*required[:-1], *OUTPUTS)
             column = _cut(raw[signal], start, stop, start + outputs_until if is_output and outputs_until else stop)
             channels[signal] = channel(path, drive_file, signal, column, first_row=start)
+    channels = _without_empty_rows(channels, required[-1])
     base = _time(path, drive_file, table, kind, raw.get("time"), channels, slice(start, stop))
     if len(base.time) < SHORTEST:
         raise DataError(f"{path}: only {len(base.time)} rows have a valid stamp; a fit needs {SHORTEST}")
@@ -219,6 +221,23 @@ def _put_together(
     for name, values in zip(("motor_angle", "load_angle"), angles, strict=True):
         signals[name] = np.concatenate([values, signals[name][len(values) :]])
     return moved
+
+
+def _without_empty_rows(channels: dict[str, Channel], driven_by: str) -> dict[str, Channel]:
+    """The channels, without the input's zeros where a sensor dropped out and the others are zero: the row is empty."""
+    motion = [found for name, found in channels.items() if name.endswith(("_angle", "_velocity"))]
+    empty = channels[driven_by].values == 0.0
+    for found in motion:
+        dropped = np.isin(np.arange(len(empty)), found.dropouts)
+        empty &= dropped | (found.values == 0.0)
+    empty &= np.isin(np.arange(len(empty)), [row for found in motion for row in found.dropouts])
+    if not empty.any():
+        return channels
+    source = channels[driven_by]
+    what = f"{empty.sum()} rows are zero throughout"
+    finding = Finding("warning", what, driven_by, "it counts as unknown there")
+    values = np.where(empty, np.nan, source.values)
+    return channels | {driven_by: replace(source, values=values, findings=(*source.findings, finding))}
 
 
 def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], outputs: Sequence[str], start: int) -> int | None:
@@ -320,7 +339,7 @@ def _time(
         rows = np.arange(start, stop)
         return TimeBase(rows - start, rows.astype(float), np.zeros(0, dtype=int), (_UNTIMED,))
     stated, beside = drive_file.sample_rate, table.sample_rate
-    if stated and beside and abs(stated / beside - 1) > 0.001:
+    if stated and beside and abs(stated / beside - 1) > _SAME_RATE:
         raise InputError(
             f"{drive_file.path}: sample_rate is {stated:g} Hz but {path} says {beside:g} Hz; correct one of them"
         )
@@ -331,17 +350,22 @@ def _time(
                 f"{path}: no time column and no sample rate; name the column in [columns] time "
                 f"or give [signals] sample_rate in {drive_file.path} ({listing(table)})"
             )
-        rows = np.arange(start, stop)
-        return TimeBase(rows - start, rows / rate, np.zeros(0, dtype=int), ())
+        return _counted(start, stop, rate)
     if column.time is not None:
         rows = np.arange(start, stop)
         return TimeBase(rows - start, column.time[start:stop], np.zeros(0, dtype=int), (), column.rate_std)
     stamps = channel(path, drive_file, "time", _cut(column, start, stop, stop), first_row=start)
     name = drive_file.column_of("time").column
     samples = np.stack([c.values for c in channels.values()], axis=1)
-    found = mended_base(path, drive_file, stamps.values, samples, name, column.unit, start)
+    try:
+        found = mended_base(path, drive_file, stamps.values, samples, name, column.unit, start)
+    except InputError as error:
+        if rate is None or "time" in drive_file.columns:
+            raise
+        reason = str(error).partition(": ")[2].partition("; ")[0]
+        return _counted(start, stop, rate, Finding("note", reason, name, "the sample rate was used in its place"))
     median = float(np.median(np.diff(found.time)))
-    if rate is not None and abs(median * rate - 1) > 0.1:
+    if rate is not None and abs(median * rate - 1) > _OFF_RATE:
         raise InputError(
             f"{path}: the column '{name}' steps by {median:g} s but the sample rate is "
             f"{rate:g} Hz; give [columns] time its unit or remove the sample rate"
@@ -351,4 +375,24 @@ def _time(
             f"{path}: the column '{name}' steps by {median:g} s, which is no sampling of a drive; "
             'give [columns] time its unit, such as "us" or "ns"'
         )
-    return replace(found, findings=(*stamps.findings, *found.findings))
+    found = replace(found, findings=(*stamps.findings, *found.findings))
+    return found if stated is None else _at_rate(found, stated, name)
+
+
+def _counted(start: int, stop: int, rate: float, *findings: Finding) -> TimeBase:
+    """Rows at a sample rate [Hz]."""
+    rows = np.arange(start, stop)
+    return TimeBase(rows - start, rows / rate, np.zeros(0, dtype=int), findings)
+
+
+def _at_rate(base: TimeBase, rate: float, name: str) -> TimeBase:
+    """Steady stamps at the stated sample rate [Hz]; others unchanged."""
+    step = np.diff(base.time) * rate
+    if len(base.restarts) or np.max(np.abs(step - 1.0)) > _OFF_RATE:
+        return base
+    time = base.time[0] + np.arange(len(base.time)) / rate
+    findings = base.findings
+    if abs(np.mean(step) - 1.0) > _SAME_RATE:
+        what = f"the stamps give {rate / np.mean(step):.6g} Hz and [signals] sample_rate {rate:.6g} Hz"
+        findings = (*findings, Finding("warning", what, name, "the latter was used"))
+    return replace(base, time=time, findings=findings, rate_std=0.0)

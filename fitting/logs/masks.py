@@ -104,7 +104,18 @@ def _of_channel(
                 "the channel looks clipped, so that these samples have weight zero in the fit",
             ),
         )
-    rows = frozen(calm, other) if other is not None else np.zeros(0, dtype=int)
+    held = np.setdiff1d(stuck(calm), np.flatnonzero(~known))
+    if len(held):
+        yield (
+            held,
+            Finding(
+                "warning",
+                f"{len(held)} samples hold one value until it jumps",
+                f"{name}, first in data row {held[0] + 1}",
+                "the sensor is stuck there, so that these samples have weight zero in the fit",
+            ),
+        )
+    rows = np.setdiff1d(frozen(calm, other), held) if other is not None else np.zeros(0, dtype=int)
     if len(rows):
         yield (
             rows,
@@ -230,6 +241,26 @@ def clipped(values: np.ndarray, other: np.ndarray | None) -> Iterator[tuple[np.n
                 continue
         rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
         yield rows, float(level), len(starts)
+
+
+def stuck(values: np.ndarray) -> np.ndarray:
+    """Rows of runs in which a channel is constant, and after which it jumps by much more than its steps nearby.
+
+    A drive that is held by friction sets off with small steps, and so does a coarse encoder.
+
+    Args:
+        values: of one channel, (n,).
+    """
+    step = np.abs(np.diff(values))
+    starts, stops = runs(step == 0)
+    long = (stops - starts >= LONGEST_DROPOUT) & (stops + LONGEST_DROPOUT < len(step))
+    found = [np.zeros(0, dtype=int)]
+    for start, stop in zip(starts[long].tolist(), stops[long].tolist(), strict=True):
+        nearby = np.append(step[stop + 1 : stop + 1 + LONGEST_DROPOUT], step[max(0, start - LONGEST_DROPOUT) : start])
+        if step[stop] > CLIFF * max(np.max(nearby), _resolution(values)):
+            # The first sample of the run is the last one that was measured.
+            found.append(np.arange(start + 1, stop + 1))
+    return np.concatenate(found)
 
 
 def frozen(values: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -57,6 +57,7 @@ def with_joined_stamps(table: RawTable, drive_file: DriveFile) -> tuple[RawTable
     if seconds is None:
         return table, drive_file, ()
     columns = table.columns | {place.column: RawColumn(seconds, "s")}
+    del columns[other]
     in_seconds = drive_file.columns | {"time": ColumnMap(place.column, "s", 1.0)}
     finding = Finding(
         "note",

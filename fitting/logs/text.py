@@ -144,6 +144,9 @@ def _decode(path: Path, raw: bytes) -> str:
             text = raw.decode("latin-1")
     # A logger that loses power may leave a block of zeros at the end of a file.
     text = text.rstrip("\0\x1a")
+    if "Â" in text:
+        # UTF-8 that was read as Latin-1 and encoded again.
+        text = re.sub("Â([°·µ²])", r"\1", text)
     if "\0" in text:
         raise InputError(f"{path}: the file is not text; export the log again or mend its suffix")
     return text
@@ -250,11 +253,11 @@ def _header(
 def _numbered(path: Path, lines: list[str], dialect: _Dialect, wanted: tuple[str, ...]) -> list[str]:
     """Names for the columns of a table without a header, where they are wanted by number."""
     names = [numbered(i + 1) for i in range(dialect.width)]
-    if not wanted or set(names) & set(wanted):
-        return names
     above = [line for line in lines[: dialect.first] if _LETTER.search(line)]
     last = len(_split(above[-1].lstrip("#%/! "), dialect.delimiter)) if above else 0
     commas = dialect.delimiter == "," and 1 < last <= dialect.width // 2
+    if set(names) & set(wanted) or not (wanted or (commas and dialect.width == 2 * last)):
+        return names
     mend = "export it with semicolons between cells, if its decimal sign is a comma" if commas else ""
     raise InputError(
         f"{path}: the file has no header line of {dialect.width} names above its {dialect.width} columns of numbers; "

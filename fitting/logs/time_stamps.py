@@ -24,6 +24,7 @@ _COARSE = 1e-4  # stamps this much finer than the step count as exact
 _MOST_STEPS = 64
 _LATEST = 1e30  # larger values are fill values
 _FEW = 0.02
+_FEWEST_DIGITS = 256  # of the last place in a step; rounding changes a longer one by less than 0.2 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,7 @@ def time_base(
     _order(mender, samples)
     _fill_blanks(mender)
     _spread_coarse(mender)
+    _tell_of_counting(mender)
     _drop_repeated(mender)
     if len(mender.time) < 2 or mender.lost > _WORST * len(stamps):
         lost = mender.lost / max(1, len(stamps))
@@ -278,7 +280,9 @@ def _spread_coarse(mender: _Mender) -> None:
     loosest = 0.01 if missing else 0.15
     if clock.slack > loosest * quantum or np.max(np.abs(off)) < _COARSE * clock.interval:
         return
-    if missing and (late.any() or np.sum(step > 1.5 * quantum) < 5) or (np.diff(clock.time) <= 0).any():
+    doubled = np.sum((step > 1.5 * quantum) & ~late)
+    # Each pause lets the clock begin anew, so that a few doubled steps say nothing.
+    if missing and doubled < 5 + 2 * late.sum() or (np.diff(clock.time) <= 0).any():
         return
     mender.time, mender.rate_std = clock.time, clock.rate_std
     mender.say(
@@ -287,6 +291,27 @@ def _spread_coarse(mender: _Mender) -> None:
         f"known to {100 * clock.rate_std:.1g} %",
         None,
         "the steady clock was used, and standard errors include its uncertainty",
+    )
+
+
+def _tell_of_counting(mender: _Mender) -> None:
+    """Warn of stamps counted up in single precision: each sum is rounded alike, so that their rate is another one."""
+    time = mender.time
+    if len(time) < _LONG or not np.array_equal(time, time.astype(np.float32)):
+        return
+    place = np.spacing(time.astype(np.float32)).astype(float)
+    step, usual = np.diff(time), np.median(place)
+    digits = step[(place[1:] == usual) & (place[:-1] == usual)] / usual
+    # A rate such as 1024 Hz has the same step at all magnitudes.
+    exact = np.ptp(step) == 0 and np.ptp(place) > 0
+    if len(digits) < _LONG or np.ptp(digits) > 0 or not 0 < digits[0] <= _FEWEST_DIGITS or exact:
+        return
+    mender.say(
+        "warning",
+        f"the stamps step by exactly {digits[0]:.0f} of the last digit of single precision, as if counted up in it, so "
+        f"that the sample rate may be off by {50 / digits[0]:.1g} %",
+        None,
+        "a stiffness is off by twice as much, unless [signals] sample_rate is stated",
     )
 
 

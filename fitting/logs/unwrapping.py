@@ -19,9 +19,7 @@ def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, 
     Returns:
         The continuous angle, the span of a jump (0 without any), and the rows that jump.
     """
-    spans = [revolution]
-    if _whole(values, 1.0):
-        spans += [2.0**bits for bits in _BITS]
+    spans = wrapping_spans(values, revolution)
     ordered = np.sort(values[np.isfinite(values)])
     if len(ordered) < 3:
         return values, 0.0, np.zeros(0, dtype=int)
@@ -43,6 +41,11 @@ def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, 
         if np.max(np.abs(folded)) < span / 4 and np.quantile(change, 0.999) < span / 8:
             return values - _turned(counted, jumps, span), span, np.flatnonzero(jumps) + 1
     return values, 0.0, np.zeros(0, dtype=int)
+
+
+def wrapping_spans(values: np.ndarray, revolution: float) -> list[float]:
+    """Spans at which an angle may wrap; arguments as in [`unwrapped_angle`][]."""
+    return [revolution, *(2.0**bits for bits in _BITS if _whole(values, 1.0))]
 
 
 def unwrapped_overflow(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:

@@ -15,10 +15,11 @@ from fitting.quasi_static.content import plain_shape
 from fitting.quasi_static.facts import ARCMIN
 from fitting.report.plots import Plot
 from fitting.report.web_page import environment
+from fitting.report.write import REPORT_FILES
 
 
 def write_report(out: Path, report: Mapping[str, Any], shown: Sequence[Plot]) -> Path:
-    """Write `report.html` and `report.json`, both or neither.
+    """Write `report.html` and `report.json`, both or neither; other files of an earlier report are removed.
 
     Args:
         out: Folder; created where absent.
@@ -30,7 +31,9 @@ def write_report(out: Path, report: Mapping[str, Any], shown: Sequence[Plot]) ->
     """
     page = out / "report.html"
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-    write_whole({page: report_page(report, shown), out / "report.json": text})
+    write_whole(
+        {page: report_page(report, shown), out / "report.json": text}, older=[out / file for file in REPORT_FILES]
+    )
     return page
 
 

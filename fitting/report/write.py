@@ -31,6 +31,9 @@ from fitting.report.unknown import curve_of, unit_in_log
 from fitting.stored_model import to_json
 from hdjax.effects.learned_axes import UNITS
 
+REPORT_FILES = ("report.html", "report.json", "model.json", DRAWS_FILE, COMMAND_FILE)
+"""All files that a report may have."""
+
 
 @dataclass(frozen=True, eq=False)
 class Report:
@@ -77,7 +80,7 @@ class Report:
 
     def write(self, folder: str | os.PathLike[str]) -> dict[str, Path]:
         """Write `report.html`, `report.json` and `model.json`, `posterior.parquet` where draws were made, and
-        `next_experiment.csv` where one is proposed: all of them or none.
+        `next_experiment.csv` where one is proposed: all of them or none. Such files of an earlier report are removed.
 
         Args:
             folder: created where absent.
@@ -95,7 +98,8 @@ class Report:
         if self.next_experiment is not None:
             contents[COMMAND_FILE] = command_table(self.next_experiment)
         paths = {file: Path(folder) / file for file in contents}
-        write_whole({paths[file]: content for file, content in contents.items()})
+        older = [Path(folder) / file for file in REPORT_FILES]
+        write_whole({paths[file]: content for file, content in contents.items()}, older=older)
         return paths
 
 

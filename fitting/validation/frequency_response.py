@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -164,9 +163,10 @@ def _linearised(model: Model, experiments: Sequence[Experiment]) -> Model:
     x = np.concatenate([twist(Stretch(e, 0, len(e)), model) for e in experiments])
     drive = model.drive
     hardening = max(1.0 + 3.0 * float(drive.alpha) * float(np.mean(x**2)), 0.0)
+    # A softening spring may leave no stiffness, with which no drive can be made anew.
     if isinstance(drive, Drive):
-        return replace(model, drive=replace(drive, K=drive.K * hardening))
-    return replace(model, drive=replace(drive, omega_0=drive.omega_0 * math.sqrt(hardening)))
+        return eqx.tree_at(lambda m: m.drive.K, model, drive.K * hardening)
+    return eqx.tree_at(lambda m: m.drive.omega_0, model, drive.omega_0 * math.sqrt(hardening))
 
 
 def _antiresonance(model: Model) -> float | None:

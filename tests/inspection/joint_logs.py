@@ -380,6 +380,50 @@ SHAPES: dict[str, Shape] = {
         joint="2",
         time="time_train",
     ),
+    "seconds and nanoseconds without telling names": Shape(
+        lambda s: {
+            "stamp": 1.7e9 + np.floor(s.time + 0.3),
+            "stamp2": np.rint(np.mod(s.time + 0.3, 1.0) * 1e9),
+            "motor_pos": s.motor_angle,
+            "link_pos": s.load_angle,
+            "torque": s.motor_torque,
+        },
+        {
+            "motor_pos": ("motor_angle", "rad", 1),
+            "link_pos": ("load_angle", "rad", 1),
+            "torque": ("motor_torque", None, 1),
+        },
+        time="stamp",
+    ),
+    "a scope that calls each clock Name": Shape(
+        lambda s: {
+            "Name": s.time * 1e3,
+            "Axis1.ActPos": s.motor_angle,
+            "Name (2)": s.time * 1e3,
+            "Axis1.ActTorque": s.motor_torque,
+            "Name (3)": s.time * 1e3,
+            "Load.Pos": s.load_angle,
+        },
+        {
+            "Axis1.ActPos": ("motor_angle", "rad", 1),
+            "Load.Pos": ("load_angle", "rad", 1),
+            "Axis1.ActTorque": ("motor_torque", None, 1),
+        },
+        time="Name",
+    ),
+    "MATLAB's iddata": Shape(
+        lambda s: {
+            "t": s.time,
+            "z.InputData": s.motor_torque,
+            "z.OutputData(:,1)": s.motor_angle,
+            "z.OutputData(:,2)": s.load_angle,
+        },
+        {
+            "z.InputData": ("motor_torque", None, 1),
+            "z.OutputData(:,1)": ("motor_angle", "rad", 1),
+            "z.OutputData(:,2)": ("load_angle", "rad", 1),
+        },
+    ),
     "nothing that is a drive": Shape(
         lambda s: {f"sensor{k}": _smooth(k, s.time.size) for k in range(4)} | {"humidity": _smooth(7, s.time.size)},
         {},

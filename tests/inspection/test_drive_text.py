@@ -133,3 +133,13 @@ def test_counter_that_wraps_at_16_bits_does_not_tell_its_revolution(motion: Moti
     columns = {"t": motion.time, "motor_enc": counts, "load_angle": motion.load_angle, "tau": motion.motor_torque}
     found = fitting.inspect(columns)
     assert found.inspection.joint.signals["motor_angle"].unit in (None, "rev / 4096")
+
+
+def test_stamps_in_two_columns_are_written_and_read(motion: Motion, tmp_path: Path):
+    stamps = {"Time": 1.7e9 + np.floor(motion.time + 0.3), "Time (2)": np.rint(np.mod(motion.time + 0.3, 1.0) * 1e6)}
+    table = stamps | {"motor_pos": motion.motor_angle, "link_pos": motion.load_angle, "torque": motion.motor_torque}
+    text = fitting.inspect(table).drive_file()
+    assert 'time = { column = "Time", unit = "s", fraction = { column = "Time (2)", unit = "us" } }' in text
+    (tmp_path / "drive.toml").write_text(fill_in(text), encoding="utf-8")
+    (log,) = fitting.load(table, drive=tmp_path / "drive.toml").logs
+    np.testing.assert_allclose(np.diff(log.time), 1e-3, rtol=1e-9)

@@ -108,6 +108,12 @@ def test_struct_arrays_and_cells_of_matlab_7_3_are_numbered_from_one(tmp_path: P
         values(path, "out/parts(2)")
 
 
+def test_sample_time_of_iddata_has_its_unit(tmp_path: Path):
+    fields = {"OutputData": np.zeros((9, 2)), "InputData": np.zeros(9), "Ts": 0.5, "TimeUnit": "milliseconds"}
+    scipy.io.savemat(tmp_path / "z.mat", {"z": fields})
+    assert read_table(tmp_path / "z.mat", ["InputData"]).sample_rate == 2000.0
+
+
 def test_attribute_of_a_group_gives_the_sample_rate(tmp_path: Path):
     path = hdf5(tmp_path, {"run/a": np.arange(4.0)})
     with h5py.File(path, "a") as file:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_files import ROWS, drive_table, one_sentence, read_drive, save, save_text
+from log_files import DRIVE, ROWS, N, drive_table, one_sentence, read_drive, save, save_text
 
 from fitting.errors import DataError, InputError
 from fitting.logs.channels import without_fill_values
@@ -150,3 +150,34 @@ def test_prediction_without_the_whole_torque_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError) as error:
         read_log(save(tmp_path, table), read_drive(tmp_path), outputs_until=50)
     one_sentence(error, "motor_torque", "throughout")
+
+
+def smooth_table(rows: int = 1000) -> dict[str, np.ndarray]:
+    """A drive log of an encoder far from zero and one that passes zero and rests there."""
+    time = np.arange(rows) * 5e-4
+    sway = np.round(1e5 * np.where(40.0 * time < 4 * np.pi, np.sin(40.0 * time), 0.0)) / 1e5
+    return {"time": time, "motor_angle": 7.0 + sway, "load_angle": sway / N, "motor_torque": 0.1 + np.cos(40.0 * time)}
+
+
+def test_zeros_far_from_their_neighbours_are_dropouts(tmp_path: Path) -> None:
+    """Singly, in long runs and at the ends; a row that is zero throughout also lacks its torque."""
+    table = smooth_table()
+    lost = [0, 1, 250, *range(300, 312), 999]
+    table["motor_angle"][lost] = 0.0
+    table["load_angle"][250] = table["motor_torque"][250] = 0.0
+    log = read_log(save(tmp_path, table), read_drive(tmp_path))
+    assert log.trusted is not None and log.input_known is not None
+    np.testing.assert_array_equal(np.flatnonzero(~log.trusted), lost)
+    np.testing.assert_array_equal(np.flatnonzero(~log.input_known), [250])
+    assert "16 samples are exactly zero" in log.findings[0].what and "row 1" in log.findings[0].where
+
+
+def test_zeros_of_motion_rest_and_wraps_are_kept(tmp_path: Path) -> None:
+    table = smooth_table()
+    # Counts that jitter about their wrap, and counts that move through it.
+    for counts in (np.random.default_rng(0).integers(-2, 3, 1000), 16000 + 32 * np.arange(1000)):
+        table["motor_angle"] = np.mod(counts, 16384).astype(float)
+        assert (table["motor_angle"] == 0.0).any()
+        text = DRIVE + '[columns]\nmotor_angle = { column = "motor_angle", unit = "rev / 16384" }\n'
+        log = read_log(save(tmp_path, table), read_drive(tmp_path, text))
+        assert log.trusted is None and not any("exactly zero" in finding.what for finding in log.findings)

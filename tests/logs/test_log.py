@@ -157,6 +157,17 @@ def test_log_without_time_or_sample_rate_is_refused(tmp_path: Path) -> None:
     one_sentence(error, "time", "sample_rate", "V1")
 
 
+def test_stated_sample_rate_is_used_where_the_stamps_are_no_clock_or_inexact(tmp_path: Path) -> None:
+    """Stamps since 1970 in single precision stand still; counted up in single precision, they run at another rate."""
+    drive = read_drive(tmp_path, DRIVE + "[signals]\nsample_rate = 2000\n")
+    single = np.full(ROWS, 5e-4, dtype=np.float32)
+    single[0] = 1000.0
+    for stamps, words in ((np.full(ROWS, np.float32(1.7e9)), "not a clock"), (np.cumsum(single), "2048 Hz")):
+        log = read_log(save(tmp_path, drive_table() | {"time": stamps.astype(float)}), drive)
+        np.testing.assert_allclose(np.diff(log.time), 5e-4, rtol=1e-9)
+        assert words in log.findings[-1].what
+
+
 def test_sample_rate_that_contradicts_the_time_stamps_is_refused(tmp_path: Path) -> None:
     text = DRIVE + "[signals]\nsample_rate = 2.0\n"
     with pytest.raises(InputError) as error:

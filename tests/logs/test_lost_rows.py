@@ -42,6 +42,14 @@ def test_rows_whose_stamps_show_the_loss_are_not_reported():
     assert not list(lost_rows(replace(log, time=kept * STEP)))
 
 
+def test_stamps_that_double_a_steady_step_are_refused():
+    """Rounded to a quantum just below the sampling interval, they show a missing row now and then."""
+    log = drive_log()
+    (finding,) = lost_rows(replace(log, time=np.floor(log.time / (0.98 * STEP)) * 0.98 * STEP))
+    assert finding.severity == "refusal" and "stamps go twice as far" in finding.what
+    assert "sample_rate" in finding.consequence
+
+
 def test_coarse_encoder_and_impacts_are_no_lost_rows():
     """Steps of a coarse encoder double by chance, and an impact changes the speed for good."""
     log = drive_log()

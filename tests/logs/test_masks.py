@@ -112,6 +112,18 @@ def test_clipped_and_stuck_angles_are_masked():
     np.testing.assert_array_equal(invalid_rows(changed(DRIVE_LOG, "motor_angle", stick)), np.arange(1000, 1400))
 
 
+def test_short_stuck_runs_are_masked():
+    """The sensor holds its value while the drive moves on, and then gives the right one again."""
+    held = [*range(801, 812), *range(2401, 2550)]
+
+    def stick(values: np.ndarray) -> None:
+        values[801:812], values[2401:2550] = values[800], values[2400]
+
+    log = changed(DRIVE_LOG, "load_angle", stick)
+    np.testing.assert_array_equal(invalid_rows(log), held)
+    assert "160 samples hold one value until it jumps" in masked(log).findings[-1].what
+
+
 def test_standstill_of_both_sides_is_not_masked():
     log = DRIVE_LOG
     for name in ("motor_angle", "load_angle"):

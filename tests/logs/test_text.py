@@ -80,6 +80,17 @@ def test_units_of_text_columns_are_read(name: str):
     assert (found.columns["time"].unit, found.columns["a"].unit) == ("s", "N m")
 
 
+def test_units_that_were_encoded_twice_are_read():
+    found = read("time [s];a (NÂ·m);b (Â°)\n0;1;2\n1;2;3\n".encode())
+    assert found.columns["a"].unit == "N·m"
+
+
+@pytest.mark.parametrize("wanted", [(), ("a",)])
+def test_decimal_commas_between_commas_are_refused(wanted: tuple[str, ...]):
+    with pytest.raises(InputError, match="semicolons between cells"):
+        read_text(Path("log.csv"), b"time,a\n" + b"0,5,1,25\n" * 9, wanted)
+
+
 @pytest.mark.parametrize(
     ("cells", "expected"),
     [

@@ -138,6 +138,23 @@ def test_rounded_stamps_with_pause_and_missing_samples_are_reconstructed():
     assert np.diff(found.time)[1995] == pytest.approx(0.25 + STEP, abs=2e-3)
 
 
+def test_single_precision_stamps_that_step_by_their_last_digit_are_reconstructed_beside_a_pause():
+    """The last digit is just below the sampling interval, so that some steps are of two."""
+    kept = np.delete(np.arange(COUNT), np.arange(3000, 3010))
+    found = time_base_of((CLOCK + 5000).astype("f4").astype(float)[kept], SAMPLES[kept])
+    assert_one_finding(found, "note", "rounded", "steady sampling")
+    np.testing.assert_allclose(np.delete(np.diff(found.time), 2999), STEP, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("start", "step", "told"), [(1000.0, 5e-4, True), (63.0, 5e-4, True), (0.0, 2.0**-10, False)])
+def test_stamps_counted_up_in_single_precision_are_warned_of(start: float, step: float, told: bool):
+    count = 100_000 if start == 0.0 else COUNT
+    stamps = np.cumsum(np.append(np.float32(start), np.full(count - 1, step, np.float32)), dtype=np.float32)
+    found = time_base_of(stamps.astype(float), np.arange(count)[:, None] * 1.0)
+    assert [finding.severity for finding in found.findings] == ["warning"] * told
+    assert all("single precision" in finding.what for finding in found.findings)
+
+
 def test_missing_samples_of_an_exact_clock_are_not_detected_as_rounding():
     kept = np.delete(np.arange(COUNT), [100, 101, 700, 1500, 2000, 2900, 3100])
     found = time_base_of(CLOCK[kept], SAMPLES[kept])

@@ -36,6 +36,13 @@ def leaves(value: object) -> Iterator[object]:
         yield value
 
 
+def test_files_of_an_earlier_report_are_removed(loop: Loop, tmp_path: Path):
+    for name in ("posterior.parquet", "next_experiment.csv", "notes.txt"):
+        (tmp_path / name).write_text("old", encoding="utf-8")
+    Report.of(loop, health=HEALTH, name="rig").write(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "report.json", "model.json", "notes.txt"}
+
+
 def test_report_json_follows_the_schema(loop: Loop, tmp_path: Path):
     paths = Report.of(loop, health=HEALTH, name="rig").write(tmp_path)
     found = json.loads(paths["report.json"].read_text(encoding="utf-8"))

@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,6 +36,19 @@ KNOWN_FAMILIES = {
     "gravity_load", "load_disturbance", "extra_resonance", "temperature", "torque_sensor", "input_delay",
     "encoder_eccentricity", "sensor_delay", "creep", "inertia_error", "unknown",
 }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("K", -1.0), ("J_m", 0.0), ("N", -50.0), ("J_l", np.nan), ("alpha", np.inf)]
+)
+def test_drive_that_cannot_be_is_refused(name: str, value: float):
+    with pytest.raises(ValueError, match=f"`{name}` must be"):
+        replace(hdc_40_050(), **{name: value})
+    with pytest.raises(ValueError, match="`omega_0` must be above 0 rad/s, but is -1"):
+        ReducedDrive(mu=1.0, omega_0=-1.0)
+    # Under a transformation there is no value to refuse.
+    slope = jax.grad(lambda K: replace(hdc_40_050(), K=K).omega_0)(jnp.asarray(7160.0))
+    assert slope > 0
 
 
 def test_preset_has_the_natural_frequency_of_its_table():
