@@ -108,7 +108,7 @@ def test_unknown_parameter_path_is_refused(path: str):
 @pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
 def test_nonpositive_value_of_a_positive_parameter_is_refused(value: float):
     with pytest.raises(ValueError, match="^`K` must be positive, but is"):
-        free_parameters(model(K=value), ("K",), {})
+        free_parameters(model().replace({"K": value}), ("K",), {})
 
 
 def test_base_paths_are_those_of_the_base_model():
