@@ -16,8 +16,8 @@ _HIGHEST_ORDER = 30
 _MOST_LINES = 20
 # Frequencies on each side with which a line is compared; below as many, slow noise may look like a line.
 _NEIGHBOURS = 20
-# Length of the discarded start-up of the process, over its largest order.
-_WARM_UP = 2000
+# Largest length of the discarded start-up of the process, and the share of its impulse response that may remain.
+_WARM_UP, _REMAINS = 2000, 1e-3
 
 
 def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -33,8 +33,10 @@ def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) 
     series = _less_sinusoids((residual - np.mean(residual))[:length])
     series = np.fft.irfft(without_lines(np.fft.rfft(series)), n=length)
     coefficients, variance = autoregression(series)
-    innovations = random.normal(size=(DRAWS, _WARM_UP + len(residual))) * np.sqrt(variance)
-    return np.asarray(lfilter([1.0], coefficients, innovations, axis=1))[:, _WARM_UP:]
+    response = np.abs(lfilter([1.0], coefficients, np.eye(1, _WARM_UP)[0]))
+    warm_up = 1 + int(np.flatnonzero(response > _REMAINS * np.max(response))[-1])
+    innovations = random.normal(size=(DRAWS, warm_up + len(residual))) * np.sqrt(variance)
+    return np.asarray(lfilter([1.0], coefficients, innovations, axis=1))[:, warm_up:]
 
 
 def _less_sinusoids(series: np.ndarray) -> np.ndarray:
