@@ -27,7 +27,7 @@ def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
             if known is None or _closeness(entry) < _closeness(known):
                 found[verdict.name] = entry
     if isinstance(outcome, Loop) and outcome.tied is not None:
-        found[FAMILY] = _unknown(outcome.tied, kept_rounds(outcome)[-1].winner, outcome.findings[0])
+        found[FAMILY] = _unknown(outcome.tied, (kept_rounds(outcome) or outcome.rounds)[-1].winner, outcome.findings[0])
     return sorted(found.values(), key=_closeness)
 
 

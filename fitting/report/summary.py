@@ -8,6 +8,7 @@ from fitting.attribution.rules import RULES
 from fitting.report.outputs import principal
 from fitting.report.separating import plain_family
 from fitting.report.unknown import place_and_variables
+from hdjax.effects.learned import FAMILY
 
 # Smallest relative change of the error that is stated.
 _HARDLY = 0.1
@@ -67,7 +68,7 @@ def _decision(report: Mapping[str, Any]) -> str:
         several = bool(report["unknown"]) or len(families) > 1
         subject = "Together they" if several else "The effect" if rest else "It"
         change = _change(subject, report, several=several)
-        return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
+        return f"{opening}: {found}.{rest} {change}{_ties(report)}{_remembering(report)}{_noisy_torque(report)}"
     left = report["unexplained"]
     missing = f"missing{_WHERE_MISSING.get(report['parameters_from'], '')}"
     missing += (
@@ -86,6 +87,21 @@ def _decision(report: Mapping[str, Any]) -> str:
         depends = "on none of the quantities that were examined"
     size = max(left["times_noise"], report["times_noise"])
     return f"{opening} The residual is {formatting.number(size)} times the measurement noise, and depends {depends}."
+
+
+def _ties(report: Mapping[str, Any]) -> str:
+    """Sentences on ties with other families than those found; empty without any."""
+    found = {e["name"]: e["family"] for e in report["after"]["effects"]}
+    tied: dict[str, dict[str, None]] = {}
+    for other in report["alternatives"]:
+        if not other["separable"] and other["family"] not in found.values():
+            family = found.get(other["instead_of"], next(iter(found.values())))
+            name = "an unknown term" if other["family"] == FAMILY else plain_family(other["family"])
+            tied.setdefault(family, {})[name] = None
+    return "".join(
+        f" The data do not tell {plain_family(family)} from {formatting.words(list(names))}."
+        for family, names in tied.items()
+    )
 
 
 def summary_of_extrapolation(told: Sequence[Mapping[str, Any]]) -> str:

@@ -128,6 +128,7 @@ def test_tie_is_reported_with_the_separating_experiment(loop: Loop):
     assert "both directions" in other["separating_experiment"]
     assert other["selection_rmse"] == other["selection_rmse_of_found"] > 0
     assert any("tie" in note for note in found["cannot_tell"])
+    assert "The data do not tell motor friction from torque sensor error." in found["summary"]
 
 
 def test_unexplained_residual_is_reported_with_its_dependence(loop: Loop):
