@@ -65,6 +65,11 @@ class LearnedCurve(eqx.Module):
     std_on_grid: Float[np.ndarray, "..."]
 
 
+def period_of(effect: Learned) -> float | None:
+    """Period of a learned function of time [s]; None of any other."""
+    return 2 * np.pi / float(effect.omega) if isinstance(effect, LearnedPeriodic) else None
+
+
 def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> LearnedCurve:
     """The curve of a learned function.
 
@@ -77,7 +82,7 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     effect = model.effect(name)
     assert isinstance(effect, Learned)
     values = np.stack([np.asarray(getattr(found.motion, v)) for v in found.chosen.variables], axis=1)
-    period = 2 * np.pi / float(effect.omega) if isinstance(effect, LearnedPeriodic) else None
+    period = period_of(effect)
     if period is not None:
         values = np.mod(values, period)
     for column, axis in zip(values.T, effect.axes, strict=True):

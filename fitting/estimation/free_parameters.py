@@ -9,12 +9,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.record import Record
 from hdjax import Drive, Model
 from hdjax.drive import Prior
 from hdjax.effects import Effect
+from hdjax.effects.learned import FAMILY
 from hdjax.parameters import own_parameters
 
 # Bounds of a parameter that the data drive towards zero or infinity, far beyond where it has any influence.
@@ -134,6 +135,12 @@ def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:
     """The model of a drive with other priors."""
     assert isinstance(model.drive, Drive)
     return replace(model, drive=replace(model.drive, priors=priors))
+
+
+def named(model: Model, paths: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
+    """Which parameters have a meaning of their own: coefficients of learned terms have none."""
+    learned = {e.name for e in model.effects if e.family == FAMILY}
+    return np.array([path.partition(".")[0] not in learned for path in paths], dtype=bool)
 
 
 def base_paths(model: Model) -> tuple[str, ...]:

@@ -3,13 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.estimate import Fit
+from fitting.estimation.free_parameters import named
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import Blocks
-from hdjax.effects.learned import FAMILY
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 16) -> int:
@@ -72,11 +72,5 @@ def _moved(
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
     moved, error = scale * (inverse @ (scale * gradient)), scale * np.sqrt(np.diag(inverse))
     # Entries of the free vector are of order one.
-    told = _named(found) & (error > 0.0) & (error < 1.0)
+    told = named(found.model, found.free.paths) & (error > 0.0) & (error < 1.0)
     return float(np.max(np.abs(moved[told]) / error[told], initial=0.0))
-
-
-def _named(found: Fit) -> Bool[np.ndarray, " parameters"]:
-    """Which parameters are not coefficients of learned terms."""
-    learned = {e.name for e in found.model.effects if e.family == FAMILY}
-    return np.array([path.partition(".")[0] not in learned for path in found.free.paths], dtype=bool)

@@ -8,7 +8,7 @@ import numpy as np
 from fitting.errors import InputError
 from fitting.inspection.columns import Column, Table
 from fitting.logs.findings import Finding
-from fitting.logs.time_stamps import TimeBase, time_base
+from fitting.logs.time_stamps import SLOWEST, TimeBase, time_base
 from fitting.logs.units import UnitError, convert, is_unit
 
 # Log odds, assumed.
@@ -28,7 +28,6 @@ _DATED = (
     ("the year 0", {"d": 86400.0}, 719529 * 86400.0),
 )
 _EPOCHS = (0.9e9, 2.5e9)  # s since 1970, of the years 1998 to 2049
-_SLOWEST = 60.0  # s between samples, assumed: a drive moves faster
 _MOST_BACK = 0.01
 _NEARLY_ALL = 0.9  # of a second, which the largest part of one exceeds
 
@@ -272,5 +271,5 @@ def _since(values: np.ndarray) -> dict[str, tuple[float, str]]:
         unit: (second, year)
         for year, units, before in _DATED
         for unit, second in units.items()
-        if _EPOCHS[0] < start * second - before < _EPOCHS[1] and step * second < _SLOWEST
+        if _EPOCHS[0] < start * second - before < _EPOCHS[1] and step * second < SLOWEST
     }

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 # All thresholds are assumed.
-_CLIFF = 10.0  # times the steps nearby
+CLIFF = 10.0  # times the steps nearby
 _RESOLUTIONS = 40.0
 _NEARBY = 5
 
@@ -40,7 +40,7 @@ def zero_dropouts(values: np.ndarray, spans: Sequence[float]) -> np.ndarray:
     # The step from the value before a run of zeros to the one behind it is not counted.
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEARBY - 1)[behind]
     usual = np.nanmax(np.where(np.isnan(around), 0.0, around), axis=1)
-    far = jump > np.maximum(_CLIFF * usual, least)
+    far = jump > np.maximum(CLIFF * usual, least)
     run = np.cumsum(np.diff(zero, prepend=zero[0]) > 1)
     length = np.bincount(run)[run]
     return zero[length <= np.max(length[far], initial=0)]

@@ -35,9 +35,8 @@ from fitting.logs.raw_table import RawColumn, RawTable
 from fitting.logs.read_table import read_table
 from fitting.logs.resampling import angles_together, on_one_grid
 from fitting.logs.split_stamps import partners, with_joined_stamps
-from fitting.logs.time_stamps import TimeBase
+from fitting.logs.time_stamps import SLOWEST, TimeBase
 
-_SLOWEST = 60.0  # s between samples; too slow for a drive's resonance, so that the unit of time must be wrong
 _SAME_RATE, _OFF_RATE = 0.001, 0.1  # relative differences of sample rates, assumed
 _AS_LOGGED = (
     *("motor_angle", "load_angle", "motor_torque", "load_torque", "joint_torque"),
@@ -370,7 +369,7 @@ def _time(
             f"{path}: the column '{name}' steps by {median:g} s but the sample rate is "
             f"{rate:g} Hz; give [columns] time its unit or remove the sample rate"
         )
-    if median > _SLOWEST:
+    if median > SLOWEST:
         raise InputError(
             f"{path}: the column '{name}' steps by {median:g} s, which is no sampling of a drive; "
             'give [columns] time its unit, such as "us" or "ns"'

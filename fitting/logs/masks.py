@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from fitting.errors import DataError
+from fitting.logs.dropouts import CLIFF
 from fitting.logs.findings import Finding
 from fitting.logs.gaps import SHORTEST
 from fitting.logs.held import without_repeats
@@ -15,7 +16,6 @@ from fitting.logs.log import Log
 SPIKE = 12.0  # robust standard deviations of the prediction error from neighbours
 DROPOUT = 40.0  # robust standard deviations of a step
 LONGEST_DROPOUT = 5
-CLIFF = 10.0  # times the neighbouring steps
 PATTERN = 0.13
 EVEN = 0.1  # of a step
 CLIPPED_SHARE = 0.002

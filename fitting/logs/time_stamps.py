@@ -26,6 +26,9 @@ _LATEST = 1e30  # larger values are fill values
 _FEW = 0.02
 _FEWEST_DIGITS = 256  # of the last place in a step; rounding changes a longer one by less than 0.2 %
 
+SLOWEST = 60.0
+"""Largest interval of samples [s], assumed: too slow for a resonance, so that the unit of time must be wrong."""
+
 
 @dataclass(frozen=True, eq=False)
 class TimeBase:

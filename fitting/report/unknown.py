@@ -7,7 +7,7 @@ import numpy as np
 
 from fitting import formatting
 from fitting.discrepancy.closed_forms import Shape, shapes
-from fitting.discrepancy.curve import PLACES, WORDS, LearnedCurve, learned_curve
+from fitting.discrepancy.curve import PLACES, WORDS, LearnedCurve, learned_curve, period_of
 from fitting.discrepancy.dynamic_laws import MemoryCandidate
 from fitting.discrepancy.dynamic_stiffness import LearnedResponse, learned_response
 from fitting.discrepancy.learn import Unknown
@@ -17,7 +17,7 @@ from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from hdjax import ReducedModel
-from hdjax.effects.learned import Learned, LearnedPeriodic
+from hdjax.effects.learned import Learned
 from hdjax.effects.learned_axes import UNITS
 from hdjax.effects.learned_memory import Lagging, LaggingShaftTorque, LearnedMemory, Yielding
 
@@ -162,8 +162,8 @@ def learned_in_words(unknown: Unknown) -> str:
     if isinstance(effect, LearnedMemory):
         return place_and_variables(_place(effect), [effect.angle], None, _memory(effect))
     assert not isinstance(unknown.chosen, MemoryCandidate)
-    period = 2 * np.pi / float(effect.omega) if isinstance(effect, LearnedPeriodic) else None
-    return place_and_variables(PLACES[effect.name], list(unknown.chosen.variables), period, None)
+    assert isinstance(effect, Learned)
+    return place_and_variables(PLACES[effect.name], list(unknown.chosen.variables), period_of(effect), None)
 
 
 def _place(effect: LearnedMemory) -> str:

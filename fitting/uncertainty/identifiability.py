@@ -1,24 +1,21 @@
-"""Identifiability: undetermined directions, insignificant parameters, and the influence of fixed values."""
+"""Identifiability: undetermined directions, and parameters that are insignificant or at a bound."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 from scipy.special import stdtrit
 
-from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit
-from fitting.estimation.projection import FirstStates
-from fitting.estimation.residual import Problem
+from fitting.estimation.free_parameters import named
 from fitting.estimation.scales import scales
 from fitting.formatting import Place, in_log_units, words
+from fitting.uncertainty.held_values import Held, held_values
 from fitting.uncertainty.sandwich import directions
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
-from hdjax import Drive, Model, OneSideModel, ReducedModel, TwoInertiaModel
+from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 from hdjax.effects import ActuatorEffect
-from hdjax.effects.learned import FAMILY
 from hdjax.parameters import ParameterInfo
 
 # A direction is not determined if two standard errors along it exceed 40 %.
@@ -27,13 +24,6 @@ _WEAK = 0.2
 _SHARE = 0.2
 # Most members of a direction whose moves are told.
 _MOST_MOVES = 3
-# Values of the drive file that no log of angles and torque can verify; their errors are in units of 1 %.
-_HELD = ("J_m", "J_l")
-_PERCENT = 0.01
-# Relative changes of a parameter beyond the reach of the linearisation.
-_MOST_LINEAR = 0.3
-# Relative step of the central differences by fixed values; their error is its square.
-_STEP = 1e-4
 # A positive parameter below this share of its starting value has ended at zero.
 _VANISHED = 1e-3
 # Relative distance within which a value is at a bound.
@@ -58,24 +48,6 @@ class Direction(eqx.Module):
     sentence: str | None
 
 
-class Held(eqx.Module):
-    """A fixed value of the drive file, and the influence of an error in it.
-
-    Attributes:
-        path: dotted path.
-        value: in SI units.
-        changes: relative change of each free parameter if the value is 1 % larger, at the fit's weights.
-        std_if_free: relative standard error of each free parameter if this value were fitted as well.
-        sentence: a sentence on this influence.
-    """
-
-    path: str = eqx.field(static=True)
-    value: float
-    changes: dict[str, float]
-    std_if_free: dict[str, float]
-    sentence: str
-
-
 class Identifiability(eqx.Module):
     """What the logs of a fit do not determine.
 
@@ -96,7 +68,9 @@ class Identifiability(eqx.Module):
         return self.bounds.get(path) or self.reasons.get(path)
 
 
-def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
+def identifiability(
+    fit: Fit, found: Uncertainty, *, drive_from: tuple[Fit, Uncertainty] | None = None
+) -> Identifiability:
     """Find what the logs of a fit do not determine.
 
     Coefficients of learned functions have no meaning one by one: of them only their influence on the named parameters
@@ -105,10 +79,13 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     Args:
         fit: the fit.
         found: its uncertainty.
+        drive_from: a fit of one side's equation that supplies the drive's parameters, and its uncertainty.
     """
     if not fit.free.paths:
         return Identifiability({}, (), (), {})
-    estimates = {p: found.estimates[p] for p in _named(fit)}
+    estimates = {
+        p: e for (p, e), own in zip(found.estimates.items(), named(fit.model, fit.free.paths), strict=True) if own
+    }
     x_max = scales(fit.stretches, fit.model).x_max
     x_unit = "rad" if isinstance(fit.model.drive, Drive) else "[x]"
     known, first = fit.model.parameters(), fit.problem.model
@@ -119,7 +96,7 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     return Identifiability(
         reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in vague.items()},
         directions=_directions(fit, found),
-        held=held_values(fit, found) if isinstance(fit.model, TwoInertiaModel) else (),
+        held=held_values(*(drive_from or (fit, found))) if drive_from or isinstance(fit.model, TwoInertiaModel) else (),
         bounds={p: sentence for p, sentence in bounds.items() if sentence is not None},
     )
 
@@ -205,19 +182,13 @@ def _reach(estimate: Estimate) -> float:
     return float(stdtrit(estimate.degrees_of_freedom, 0.975)) * estimate.std
 
 
-def _named(fit: Fit) -> list[str]:
-    """The free parameters without the coefficients of learned functions."""
-    learned = tuple(f"{e.name}." for e in fit.model.effects if e.family == FAMILY)
-    return [path for path in fit.free.paths if not path.startswith(learned)]
-
-
 def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:
     """Principal axes of the covariance of the named parameters, in units of the free vector, which are of order one.
 
     A part of the whole covariance is that of its parameters where all others are fitted as well.
     """
-    paths = _named(fit)
-    own = [fit.free.paths.index(path) for path in paths]
+    own = np.flatnonzero(named(fit.model, fit.free.paths))
+    paths = [fit.free.paths[i] for i in own]
     logarithmic, scale = np.array(fit.free.logarithmic)[own], np.asarray(fit.free.scale)[own]
     units = dict(zip(paths, np.where(logarithmic, 1.0, scale).tolist(), strict=True))
     made: list[Direction] = []
@@ -337,83 +308,3 @@ def parameters_at_bounds(model: Model, name: str) -> list[str]:
     """
     known = {p: v for p, v in model.parameters().items() if p.startswith(f"{name}.")}
     return [p for p, (v, info) in known.items() if reached_bound(float(v), _in_units_of(model, info)) is not None]
-
-
-# Parameters without any information are not at a bound.
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def held_values(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
-    """Fixed values of the drive file that a fit of both sides or of one side's equation relies on; an effect may
-    correct one.
-
-    Args:
-        fit: the fit.
-        found: its uncertainty.
-    """
-    free = {*fit.free.paths, *(effect.corrects for effect in fit.model.effects)}
-    known = fit.model.scaled_by if isinstance(fit.model, OneSideModel) else _HELD
-    held = tuple(p for p in _HELD if p in known and p not in free)
-    if not held:
-        return ()
-    products = np.asarray(_products(fit, held))
-    count = len(fit.free.paths)
-    information, coupling = products[:count, :count], products[:count, count:]
-    # The optimum moves so that the gradient remains zero: (J^T J) dp + J^T dr/dJ dJ = 0.
-    response = -np.linalg.lstsq(information, coupling, rcond=None)[0]
-    values = np.array([e.value for e in found.estimates.values()])
-    relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
-    classical = np.linalg.pinv(information, hermitian=True)
-    robust = np.diag(found.covariance) / np.diag(classical)
-    named, made = set(_named(fit)), []
-    for i, path in enumerate(held):
-        own = products[count + i, count + i] - coupling[:, i] @ classical @ coupling[:, i]
-        if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
-        std_if_free = np.nan_to_num(relative * np.sqrt(robust * if_free), nan=np.inf)
-        change = _PERCENT * response[:, i] * np.sign(values) * relative
-        made.append(
-            _held_one(
-                fit,
-                path,
-                {p: value for p, value in zip(found.estimates, change.tolist(), strict=True) if p in named},
-                {p: value for p, value in zip(found.estimates, std_if_free.tolist(), strict=True) if p in named},
-            )
-        )
-    return tuple(made)
-
-
-def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[str, float]) -> Held:
-    own = {p: c for p, c in changes.items() if "." not in p and p != "alpha"}
-    sentence = f"{path} is taken from the drive file"
-    if any(abs(c) > _MOST_LINEAR for c in own.values()):
-        sentence += f", and must be correct there: {words(list(own))} can't compensate an error of 1 %."
-    elif own:
-        moved = words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
-        sentence += f": if it is 1 % too large there, that changes {moved}."
-    else:
-        sentence += "."
-    return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)
-
-
-def _products(fit: Fit, held: tuple[str, ...]) -> Float[np.ndarray, "all all"]:
-    """J^T J of the free parameters and the logarithms of fixed values, without the initial states.
-
-    By central differences with the fit's compiled program.
-    """
-    problem = fit.at_solution
-    found = linearise(problem, fit.unknowns)
-    rows, gaps = [], []
-    for path in held:
-        value = float(fit.model.get(path))
-        up, down = (
-            linearise(_with_held(problem, path, value * (1.0 + sign * _STEP)), fit.unknowns) for sign in (1, -1)
-        )
-        rows.append((up.residual - down.residual) / (2 * _STEP))
-        gaps.append((up.gap - down.gap) / (2 * _STEP))
-    states = FirstStates.of(found, problem.segments.joined)
-    columns, before = np.stack(rows, axis=-1), -np.stack(gaps, axis=-1)
-    both = np.concatenate([states.parameters_without(found), states.without(columns, before)], axis=2)
-    flat = both.reshape(-1, both.shape[-1])
-    return flat.T @ flat
-
-
-def _with_held(problem: Problem, path: str, value: float) -> Problem:
-    return eqx.tree_at(lambda p: p.model, problem, problem.model.replace({path: value}))

@@ -1,7 +1,6 @@
 """Free runs of a fitted model on each part of the data, to compare models before and after attribution."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -11,7 +10,7 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_run import FreeRun, free_run, rms_error
 from fitting.estimation.late_readings import unaligned
-from fitting.uncertainty.identifiability import Identifiability, held_values, identifiability
+from fitting.uncertainty.identifiability import Identifiability, identifiability
 from fitting.uncertainty.profile_likelihood import with_profiles
 from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
 from hdjax import Model
@@ -104,11 +103,11 @@ def of_parameters(
     found = uncertainty(judged)
     if profiles:
         found = with_profiles(judged, found)
+    side = None
     if drive_from is not None:
-        found = found.with_parameters_of(uncertainty(drive_from).in_units_of(fit, drive_from))
-    told = identifiability(judged, found)
-    if drive_from is not None:
-        told = replace(told, held=held_values(drive_from, uncertainty(drive_from)))
+        side = drive_from, uncertainty(drive_from)
+        found = found.with_parameters_of(side[1].in_units_of(fit, drive_from))
+    told = identifiability(judged, found, drive_from=side)
     return (found if std_from is None else found.in_units_of(fit, std_from)), told
 
 

@@ -10,8 +10,8 @@ import rig
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
 from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.held_values import _held_one
 from fitting.uncertainty.identifiability import (
-    _held_one,
     at_bound,
     identifiability,
     needed_samples,
