@@ -49,7 +49,7 @@ def report_page(report: Mapping[str, Any], shown: Sequence[Plot]) -> str:
     }
     template = "quasi_static.html.jinja" if report["decision"] == "fit_only" else "quasi_static_loop.html.jinja"
     page = environment(filters).get_template(template)
-    return page.render(report=report, pictures=shown, plotlyjs=Markup(get_plotlyjs()))
+    return page.render(report=report, plots=shown, plotlyjs=Markup(get_plotlyjs()))
 
 
 def _value(known: Mapping[str, Any]) -> str:

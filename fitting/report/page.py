@@ -66,6 +66,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
             quantiles=QUANTILES,
             next_lines=next_lines(report),
             sections={s: [p for p in pictures if p.section == s] for s in _SECTIONS},
+            plots=[p for p in pictures if p.section in _SECTIONS],
             plotlyjs=Markup(get_plotlyjs()),
         )
     )
