@@ -5,7 +5,6 @@ from typing import Any
 
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.selection_round import Verdict
-from fitting.discrepancy.learn import Unknown
 from fitting.outcome import Finding, Loop, kept_rounds
 from fitting.report.outcome import Outcome
 from fitting.report.separating import separating_experiment
@@ -22,45 +21,46 @@ def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
         for verdict in this.verdicts:
             if verdict.trial is None or verdict.name in names or (verdict.family in families and verdict.separable):
                 continue
-            entry = _alternative(verdict, verdict.trial, this.winner)
+            entry = _alternative(verdict.family, verdict.name, verdict.trial, this.winner, separable=verdict.separable)
             known = found.get(verdict.name)
             if known is None or _closeness(entry) < _closeness(known):
                 found[verdict.name] = entry
-    if isinstance(outcome, Loop) and outcome.tied is not None:
-        found[FAMILY] = _unknown(outcome.tied, (kept_rounds(outcome) or outcome.rounds)[-1].winner, outcome.findings[0])
+    if isinstance(outcome, Loop) and (tied := outcome.tied) is not None:
+        last, name = (kept_rounds(outcome) or outcome.rounds)[-1].winner, f"learned {learned_in_words(tied)}"
+        found[FAMILY] = _alternative(FAMILY, name, tied.trial, last, instead_of=outcome.findings[0])
     return sorted(found.values(), key=_closeness)
 
 
-def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, Any]:
-    experiment = separating_experiment(winner.family, verdict.family)
-    if verdict.separable:
-        experiment = "None is needed: the selection data distinguish the two."
-    return {
-        "family": verdict.family,
-        "name": verdict.name,
-        "selection_rmse": trial.held_out.principal_std,
-        "separable": verdict.separable,
-        "separating_experiment": experiment,
-        "instead_of": winner.name,
-        "selection_rmse_of_found": None if winner.trial is None else winner.trial.held_out.principal_std,
-    }
-
-
-def _unknown(tied: Unknown, winner: Verdict, first: Finding) -> dict[str, Any]:
-    """A learned term.
+def _alternative(
+    family: str,
+    name: str,
+    trial: Trial,
+    winner: Verdict,
+    *,
+    instead_of: Finding | None = None,
+    separable: bool = False,
+) -> dict[str, Any]:
+    """An explanation beside the found one.
 
     Args:
-        tied: the term.
-        winner: of the last round.
-        first: of the found effects.
+        family: of the explanation.
+        name: of the explanation.
+        trial: the model with it.
+        winner: of the round, whose error it is compared with.
+        instead_of: the effect that it replaces; the winner where not given.
+        separable: whether selection data distinguish the two.
     """
+    replaced = instead_of or winner
+    experiment = separating_experiment(replaced.family, family)
+    if separable:
+        experiment = "None is needed: the selection data distinguish the two."
     return {
-        "family": FAMILY,
-        "name": f"learned {learned_in_words(tied)}",
-        "selection_rmse": tied.trial.held_out.principal_std,
-        "separable": False,
-        "separating_experiment": separating_experiment(first.family, FAMILY),
-        "instead_of": first.name,
+        "family": family,
+        "name": name,
+        "selection_rmse": trial.held_out.principal_std,
+        "separable": separable,
+        "separating_experiment": experiment,
+        "instead_of": replaced.name,
         "selection_rmse_of_found": None if winner.trial is None else winner.trial.held_out.principal_std,
     }
 
