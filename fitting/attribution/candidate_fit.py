@@ -39,7 +39,7 @@ class Trial(eqx.Module):
         training: the fit.
         held_out: fit to held-out data with the same parameters; only initial states are free.
         hold: inter-sample behaviour of the torque.
-        lasting: share of its gain that persists in free runs along whole stretches.
+        lasting: share of its gain that persists over whole stretches.
     """
 
     model: Model
@@ -234,24 +234,19 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
     short = before.held_out.objective - trial.held_out.objective
     if not effect.states or short <= 0.0:
         return 1.0
-    long_before, long_after = (
-        without_gaps(over_whole_stretches(t.held_out, least_progress=LEAST_PROGRESS)) for t in (before, trial)
-    )
-    if not (follows(long_before) or follows(long_after)):
-        return 1.0
-    return float(np.clip((long_before.objective - long_after.objective) / short, 0.0, 1.0))
+    long = long_gains(before, [trial])
+    return 1.0 if long is None else float(np.clip(long[0] / short, 0.0, 1.0))
 
 
-def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[float] | None:
-    """Gains of trials over the preceding model in free runs along whole held-out stretches: logarithms of error ratios.
-    None where free runs are inconclusive: the preceding model diverges, or neither it nor a trial follows the drive for
-    long.
+def long_gains(before: Trial, trials: Sequence[Trial]) -> list[float] | None:
+    """Gains of trials over the preceding model along whole held-out stretches, whose initial states are fitted to all
+    samples. None where no model follows the drive for so long, or the preceding one diverges.
     """
-    errors = long_errors([before, *trials], study)
-    if errors is None or not np.isfinite(errors[0]):
+    whole = [without_gaps(over_whole_stretches(t.held_out, least_progress=LEAST_PROGRESS)) for t in (before, *trials)]
+    first, *others = (fitted.objective for fitted in whole)
+    if not (np.isfinite(first) and any(follows(fitted) for fitted in whole)):
         return None
-    before_long, *after_long = errors
-    return [float(np.log(before_long) - np.log(after)) for after in after_long]
+    return [float(first - objective) if np.isfinite(objective) else -np.inf for objective in others]
 
 
 def long_errors(trials: Sequence[Trial], study: Study) -> list[float] | None:

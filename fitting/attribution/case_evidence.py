@@ -48,7 +48,7 @@ class Rival:
     Attributes:
         name: of the form.
         gain: over short segments.
-        long_gain: in free runs along whole stretches; over short segments where these are inconclusive.
+        long_gain: over whole stretches; over short segments where these are inconclusive.
         tied: whether it is tied with the best one over short segments.
         parameters: number of free parameters.
         states: number of states.
@@ -213,7 +213,7 @@ class CaseEvidence:
 
 # The number that stands for infinity, which JSON lacks.
 _ENDLESS = sys.float_info.max
-# What null means in earlier reports. Free runs of a rival may diverge, which no gain offsets.
+# What null means in earlier reports. Long simulations of a rival may diverge, which no gain offsets.
 _INFINITE = dict.fromkeys(
     ("removed", "strength_errors", "over_noise", "gain", "training", "selection", "noise", "longer_worse"), math.inf
 ) | {"long_gain": -math.inf}

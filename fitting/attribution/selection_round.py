@@ -154,7 +154,19 @@ class _Refits:
         self._refit(screened.leads, self.study, 0.0)
 
     def in_proportion(self, screened: Screen) -> None:
-        """Refit the most likely form of each family, and further forms near the best one."""
+        """Refit the most likely form of each family, further forms near the best one, and the forms that the best one
+        contains: with fewer parameters they may be supported where that one is not."""
+        self._likely(screened)
+        if self.done:
+            best = self._best()
+            contained = [a for a in screened.leads if a.effect.name in best.model.effects[-1].contains]
+            study = self.study.with_substeps(best.training.substeps)
+            self._refit([a for a in contained if a.effect.name not in self.done], study)
+
+    def _best(self) -> Trial:
+        return max(self.done.values(), key=lambda trial: trial.gain_over(self.before))
+
+    def _likely(self, screened: Screen) -> None:
         before = self.before
         worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
         swing = self.study.scales(before.training.stretches, before.model)
@@ -169,7 +181,7 @@ class _Refits:
         hidden = [a for a in screened.leads if self.study.suspects(a.effect, before.model) and a not in first]
         self._refit([*first[1:], *hidden], self.study)
         if self.done:
-            best = max(self.done.values(), key=lambda trial: trial.gain_over(before))
+            best = self._best()
             near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
             families = [
                 a.effect.family
@@ -241,7 +253,7 @@ def _supported_first(
         asked.append(ask(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
-        if verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:
+        if verdict.gain <= 0.0 or verdict.p_value > RULES.significance:
             # The following ones gain less.
             break
     return verdicts, tuple(asked), False
@@ -269,7 +281,7 @@ def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
 def simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:
     """The candidates with the chosen one of several ties first, and the evidence of the ties.
 
-    Short segments hide slow errors, and leave hidden states free; so free runs along whole stretches decide.
+    Short segments hide slow errors, and leave hidden states free; so simulations along whole stretches decide.
     """
     refitted = [v for v in verdicts if v.trial is not None]
     best, *others = (_rival(v, before) for v in refitted)
@@ -278,7 +290,10 @@ def simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tupl
         return verdicts, ()
     competing = [v for v in refitted if v.name in near]
     trials = [v.trial for v in competing if v.trial is not None]
-    gains = long_gains(before, trials, study) or [v.gain for v in competing]
+    gains = long_gains(before, trials)
+    if gains is None or max(gains) <= RULES.least_gain:
+        # Whole stretches decide nothing.
+        gains = [v.gain for v in competing]
     rivals = tuple(replace(_rival(v, before), long_gain=g) for v, g in zip(competing, gains, strict=True))
     first, close = leader(rivals)
     if not first.tied:

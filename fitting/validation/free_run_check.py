@@ -15,8 +15,8 @@ from fitting.uncertainty.standard_errors import uncertainty
 def share_explained(
     before: Sequence[FreeRun], after: Sequence[FreeRun], held_out: Fit, noise: Float[Array, "outputs outputs"]
 ) -> float | None:
-    """Share of the variance beyond noise, of the base model's free runs, that the effects remove. None where both
-    models diverge.
+    """Share of the variance beyond noise, of the base model's free runs, that the effects remove; -1 where they at
+    least double it. None where both models diverge.
 
     Args:
         before: free runs of the base model along the held-out stretches.
@@ -27,7 +27,7 @@ def share_explained(
     variance = float(_short_error(held_out, noise)[-1, -1])
     at_first = max(rms_error(before) ** 2 - variance, np.finfo(float).tiny)
     share = 1.0 - (rms_error(after) ** 2 - variance) / at_first
-    return None if np.isnan(share) else share
+    return None if np.isnan(share) else float(np.clip(share, -1.0, 1.0))
 
 
 def surprise(

@@ -19,6 +19,9 @@ _BENDS = (0.1, 0.02, 0.5)
 # Stribeck rates: as a share of the shaft's, and at the output [rad/s], from the upper part of EFFECTS' 1e-3 to 0.1.
 # From below, the excess grows without limit in place of the rate.
 _SHARE_OF_RATE, _AT_OUTPUT = 0.2, (0.1, 0.03)
+# Damping of the bristles over their stiffness, times the natural frequency of the dynamic error. It is
+# 2 zeta sqrt(J / sigma_0), so in weak friction bristles resist mostly by damping, hardly by their bend.
+_DAMPING, _MOSTLY_DAMPING = 0.3, 100.0
 
 
 class DahlMotorFriction(MotorSideEffect):
@@ -105,9 +108,13 @@ class _LuGre(Effect):
     @classmethod
     def at_rates(cls, rate: float, ratio: float, scales: Scales) -> tuple[Effect, ...]:
         """Proposals (starting values) for a shaft that turns at such rates [rad/s], `ratio` times the output's."""
-        shape = {"tau": 0.3 / scales.natural_frequency, "settling": SETTLING_SHARE * scales.time_step}
+        settling, bends = SETTLING_SHARE * scales.time_step, _bends(rate, scales)
         slow = (_SHARE_OF_RATE * rate, *(ratio * omega_s for omega_s in _AT_OUTPUT))
-        return tuple(cls(bend=bend, omega_s=omega_s, **shape) for omega_s in slow for bend in _bends(rate, scales))
+        shapes = [(omega_s, bend, _DAMPING) for omega_s in slow for bend in bends]
+        return tuple(
+            cls(bend=bend, omega_s=omega_s, tau=damping / scales.natural_frequency, settling=settling)
+            for omega_s, bend, damping in (*shapes, (slow[0], bends[0], _MOSTLY_DAMPING))
+        )
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         (slipping,) = self.state_rates(motion, state)

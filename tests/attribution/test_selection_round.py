@@ -12,6 +12,8 @@ from fitting.attribution import candidate_fit as of_a_trial
 from fitting.attribution import selection_round as attribution
 from fitting.attribution import support
 from fitting.attribution.candidate_fit import Trial, attempt, halo_for
+from fitting.attribution.case_evidence import EffectEvidence
+from fitting.attribution.screening import Lead, Screen
 from fitting.attribution.selection_round import Verdict, look
 from fitting.attribution.study import Setting, Study
 from fitting.attribution.support import Standing
@@ -25,7 +27,7 @@ from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
-from hdjax.effects.friction import MotorFriction
+from hdjax.effects.friction import MotorFriction, ViscousMotorFriction
 from hdjax.effects.position import PositionDependentMotorFriction
 from hdjax.effects.presliding import DahlMotorFriction
 
@@ -99,11 +101,11 @@ def test_lasting_share_is_that_of_the_gain_over_whole_stretches(
         (2.00, 2.01, "torque_bias"),  # equal: the simpler one
         (1.00, 2.00, "creep"),
         (2.00, 1.00, "torque_bias"),
-        (None, 2.00, "creep"),  # free runs are not available: short segments decide
-        (-np.inf, -np.inf, "torque_bias"),
+        (None, 2.00, "creep"),  # no model follows whole stretches: short segments decide
+        (-np.inf, -np.inf, "creep"),  # none gains anything: likewise
     ],
 )
-def test_free_runs_decide_between_tied_candidates(
+def test_whole_stretches_decide_between_tied_candidates(
     verdicts, bias_long: float | None, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
 ):
     before, found = verdicts
@@ -112,7 +114,7 @@ def test_free_runs_decide_between_tied_candidates(
     tied.sort(key=lambda v: -v.gain)
     long = {id(found["torque_bias"].trial): bias_long, id(found["creep"].trial): creep_long}
 
-    def long_gains(before, trials, study):
+    def long_gains(before, trials):
         gains = [long[id(trial)] for trial in trials]
         return None if None in gains else gains
 
@@ -136,7 +138,7 @@ def test_form_with_memory_leads_only_with_a_gain_over_whole_stretches(
         Verdict("torque_bias", bias.family, bias.trial, 0.05, 0.005, True),
     ]
     long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
-    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, study: [long[id(t)] for t in trials])
+    monkeypatch.setattr(attribution, "long_gains", lambda before, trials: [long[id(t)] for t in trials])
     (first, second), rivals = attribution.simplest_first(ordered, before, STUDY)
     assert {r.name: r.long_gain for r in rivals} == {"torque_bias": 2.0, "creep": creep_long}
     assert (first.name, first.separable, second.separable) == (leader, False, True)
@@ -144,7 +146,7 @@ def test_form_with_memory_leads_only_with_a_gain_over_whole_stretches(
 
 def test_form_without_memory_is_preferred_at_equal_parameter_count(verdicts, monkeypatch: pytest.MonkeyPatch):
     _, found = verdicts
-    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, study: [1.0] * len(trials))
+    monkeypatch.setattr(attribution, "long_gains", lambda before, trials: [1.0] * len(trials))
 
     def verdict(effect: Effect) -> Verdict:
         model = rig.drive_model().with_effects(effect)
@@ -176,6 +178,42 @@ def test_ties_are_those_of_the_first_candidate(verdicts, monkeypatch: pytest.Mon
     best, chosen, third = candidates
     assert tied([best, chosen, third]) == ["best", "chosen"]
     assert tied([chosen, best, third]) == ["chosen", "best", "third"]
+
+
+def test_a_simpler_form_of_less_gain_is_asked_where_noise_explains_the_residual(verdicts):
+    """Against a noise model no least gain is asked for, and each parameter costs some likelihood."""
+    _, found = verdicts
+    trial = found["torque_bias"].trial
+    over_noise = {"with_four_parameters": -5.0, "with_one_parameter": 12.0}
+    tried = [Verdict(name, "family", trial, 0.0007, 0.002, False) for name in over_noise]
+
+    def ask(verdict: Verdict) -> EffectEvidence:
+        return EffectEvidence(verdict.name, verdict.gain, verdict.p_value, over_noise=over_noise[verdict.name])
+
+    ordered, asked, accepted = attribution._supported_first(tried, ask)
+    assert accepted and ordered[0].name == "with_one_parameter" and len(asked) == 2
+
+
+def test_forms_that_the_best_one_contains_are_refitted(verdicts, monkeypatch: pytest.MonkeyPatch):
+    before, found = verdicts
+    wide, narrow, other = (
+        MotorFriction(transition=0.1),
+        ViscousMotorFriction(),
+        DahlMotorFriction(bend=1.0, settling=1.0),
+    )
+    screened = Screen(tuple(Lead(e, {}, 1.0) for e in (wide, narrow, other)), np.zeros(1))
+    trial = eqx.tree_at(lambda t: t.model, found["torque_bias"].trial, rig.drive_model().with_effects(wide))
+    asked = []
+
+    def refit(self, leads, study, share=0.0):
+        asked.extend(lead.effect.name for lead in leads)
+
+    refits = attribution._Refits(before, STUDY)
+    refits.done = {wide.name: trial}
+    monkeypatch.setattr(attribution._Refits, "_likely", lambda self, screened: None)
+    monkeypatch.setattr(attribution._Refits, "_refit", refit)
+    refits.in_proportion(screened)
+    assert asked == [narrow.name]
 
 
 def with_error(trial: Trial, rms: float, *, by_effects: float = 0.0) -> Trial:

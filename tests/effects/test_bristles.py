@@ -1,5 +1,7 @@
 """Bristle friction and Maxwell slip against closed forms and a numpy implementation."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdjax import Drive
-from hdjax.effects import Effect, Motion
+from hdjax.effects import Effect, Motion, Scales
 from hdjax.effects.bristle import bristle_rate, slip_rate
 from hdjax.effects.hysteresis import Dahl, MaxwellSlip
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
@@ -229,3 +231,31 @@ def test_motor_bristle_friction_returns_no_more_work_than_it_stored(effect):
     # The trapezoid errs by some 1e-6 of the work.
     assert np.all(np.diff(lost) > -1e-6 * work[-1])
     assert lost[-1] > 0.9 * work[-1]
+
+
+def lugre_torque(effect: LuGreMotorFriction) -> tuple[np.ndarray, np.ndarray]:
+    """Torque and motor rate along a motion with slow and quick reversals."""
+    step = 2e-4
+    t = step * np.arange(4001)
+    rate = lambda t: 30.0 * np.cos(60.0 * t) * np.cos(7.0 * t) + 4.0 * np.sin(200.0 * t)  # noqa: E731
+    rates = jnp.asarray(rate(np.stack([t[:-1], t[:-1] + step / 2, t[1:]], axis=1)))
+    states = states_along(effect, rates[:, 0], rates, jnp.asarray(step))[1:]
+    end = rates[:, 2]
+    torque = jax.vmap(lambda s, r: effect.torque(Motion(x=r, v=r, omega_m=r), DRIVE, s))(states, end)
+    return np.asarray(torque), np.asarray(end)
+
+
+@pytest.mark.parametrize("damping", [0.1, 1.0, 10.0, 100.0, 1000.0])
+def test_proposals_resemble_bristles_of_any_damping(damping: float):
+    """Beside viscous friction a proposal explains most of the torque, whether bristles resist by bend or by damping."""
+    scales = Scales(
+        x=1e-3, x_max=2e-3, v=0.2, omega_m=20.0, omega_l=0.4, time_step=1e-3, reduction_ratio=50.0, omega_0=200.0
+    )
+    true = LuGreMotorFriction(T_c=1.0, bend=0.01, omega_s=2.0, tau=damping / 200.0, settling=2.5e-4)
+    torque, rate = lugre_torque(true)
+    shares = []
+    for proposal in LuGreMotorFriction.proposals(scales):
+        columns = np.stack([lugre_torque(replace(proposal, T_c=1.0))[0], rate], axis=1)
+        left = torque - columns @ np.linalg.lstsq(columns, torque, rcond=None)[0]
+        shares.append(1.0 - left.var() / torque.var())
+    assert max(shares) > 0.9
