@@ -14,7 +14,6 @@ from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import fitted_paths
-from fitting.estimation.free_run import FreeRun, free_run, rms_error
 from fitting.estimation.problem import states_from
 from fitting.estimation.whole_log_fit import follows, over_whole_stretches, with_memory_carried, without_gaps
 from fitting.uncertainty.identifiability import parameters_at_bounds
@@ -247,26 +246,6 @@ def long_gains(before: Trial, trials: Sequence[Trial]) -> list[float] | None:
     if not (np.isfinite(first) and any(follows(fitted) for fitted in whole)):
         return None
     return [float(first - objective) if np.isfinite(objective) else -np.inf for objective in others]
-
-
-def long_errors(trials: Sequence[Trial], study: Study) -> list[float] | None:
-    """Rms errors of free runs along whole held-out stretches, infinite where one diverges. None where none of them
-    follows the drive for long, as where its motion is chaotic."""
-    runs = [_free_runs(trial, study) for trial in trials]
-    errors, moves = [rms_error(own) for own in runs], float(np.std(np.concatenate([r.measured for r in runs[0]])))
-    return errors if min(errors) <= 0.5 * moves else None
-
-
-def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
-    """Free runs of the held-out stretches."""
-    return free_run(
-        trial.model,
-        study.data[trial.hold][1],
-        covariance=trial.training.covariance,
-        halo=study.setting.halo,
-        substeps=trial.training.substeps,
-        like=trial.held_out,
-    )
 
 
 def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int:

@@ -1,12 +1,13 @@
 """Check of named effects by learned terms: where a residual remains, one is learned beside them and one in their
 place."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Trial, long_errors
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
 from fitting.attribution.decisions import names_stand, next_question, unknown_ties
 from fitting.attribution.effect_search import refitted_without
@@ -23,6 +24,7 @@ from fitting.attribution.support import (
 from fitting.discrepancy.learn import Unknown, learn_supported, share_of
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import half_log_determinant
+from fitting.estimation.free_run import FreeRun, free_run, rms_error
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
 
@@ -90,7 +92,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         return Challenge(base, beside, left, None, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
-        errors = long_errors([rival, instead.trial], study)
+        errors = _long_errors([rival, instead.trial], study)
         worse = 0.0 if errors is None else float(np.log(errors[1]) - np.log(errors[0]))
         seen = replace(seen, longer_worse=worse)
     if instead is not None and beside is not None:
@@ -183,4 +185,24 @@ def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Stud
     gain = bare.held_out.objective - trial.held_out.objective
     return bare, replace(
         beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
+    )
+
+
+def _long_errors(trials: Sequence[Trial], study: Study) -> list[float] | None:
+    """Rms errors of free runs along whole held-out stretches, infinite where one diverges. None where none of them
+    follows the drive for long, as where its motion is chaotic."""
+    runs = [_free_runs(trial, study) for trial in trials]
+    errors, moves = [rms_error(own) for own in runs], float(np.std(np.concatenate([r.measured for r in runs[0]])))
+    return errors if min(errors) <= 0.5 * moves else None
+
+
+def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
+    """Free runs of the held-out stretches."""
+    return free_run(
+        trial.model,
+        study.data[trial.hold][1],
+        covariance=trial.training.covariance,
+        halo=study.setting.halo,
+        substeps=trial.training.substeps,
+        like=trial.held_out,
     )

@@ -237,7 +237,7 @@ def test_share_of_a_replacing_term_is_that_of_the_names_that_are_left(base: Tria
     monkeypatch.setattr(module, "_without_learned", lambda *_: None)
     monkeypatch.setattr(module, "_without_superfluous", lambda *_: (bare, replace(beside, before=bare)))
     monkeypatch.setattr(module, "share_of", lambda model, *_: 0.1 * len(model.effects))
-    monkeypatch.setattr(module, "long_errors", lambda *_: None)
+    monkeypatch.setattr(module, "_long_errors", lambda *_: None)
     monkeypatch.setattr(module, "nonzero_effects", lambda fit, names: names)
     monkeypatch.setattr(module, "leaves_imperfection", lambda _, __, noise: (False, noise))
     monkeypatch.setattr(module, "leaves_white_noise", lambda _: False)
