@@ -61,7 +61,7 @@ def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ..
     study = study.with_substeps(current.training.substeps)
     tried = [replace(winner, trial=current), *(_instead_of(winner, *rival, current, study) for rival in rivals)]
     tried, _ = with_ties(sorted((v for v in tried if v.trial is not None), key=lambda v: -v.gain))
-    tried, _ = simplest_first(tried, this.before, study)
+    tried, _ = simplest_first(tried, this.before)
     (first, *rest), _ = with_ties(tried)
     names = {v.name for v, _ in rivals}
     apart = [v for v in others if v.name not in names]

@@ -134,7 +134,7 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
 
     verdicts, asked, accepted = _supported_first(found, ask)
     if accepted:
-        found, rivals = simplest_first(found, before, study)
+        found, rivals = simplest_first(found, before)
         if rivals and leader(rivals)[0].tied:
             # Others may be tied with the chosen one that are not with the best one.
             found, tied = with_ties(found)
@@ -154,19 +154,19 @@ class _Refits:
         self._refit(screened.leads, self.study, 0.0)
 
     def in_proportion(self, screened: Screen) -> None:
-        """Refit the most likely form of each family, further forms near the best one, and the forms that the best one
-        contains: with fewer parameters they may be supported where that one is not."""
+        """Refit likely forms, and those that the best one contains: with fewer parameters they may be supported where
+        that one is not."""
         self._likely(screened)
         if self.done:
             best = self._best()
-            contained = [a for a in screened.leads if a.effect.name in best.model.effects[-1].contains]
-            study = self.study.with_substeps(best.training.substeps)
-            self._refit([a for a in contained if a.effect.name not in self.done], study)
+            contained = set(best.model.effects[-1].contains) - self.done.keys()
+            self._beside(best, [lead for lead in screened.leads if lead.effect.name in contained], _HOPELESS)
 
     def _best(self) -> Trial:
         return max(self.done.values(), key=lambda trial: trial.gain_over(self.before))
 
     def _likely(self, screened: Screen) -> None:
+        """Refit the most likely form of each family, and further forms near the best one."""
         before = self.before
         worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
         swing = self.study.scales(before.training.stretches, before.model)
@@ -208,9 +208,9 @@ class _Refits:
         refits = [t for t in self.done.values() if _are_siblings(lead.effect, t.model.effects[-1])]
         return min(refits, key=lambda trial: trial.training.objective, default=None)
 
-    def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
+    def _beside(self, best: Trial, leads: Sequence[Lead], share: float = 1.0 - _NEAR_TIE) -> None:
         # Comparable first passes need its number of solver steps.
-        self._refit(leads, self.study.with_substeps(best.training.substeps), 1.0 - _NEAR_TIE)
+        self._refit(leads, self.study.with_substeps(best.training.substeps), share)
 
     def forms(self, screened: Screen) -> list[Verdict]:
         """Results of all forms, with the first-order gain of those that were not refitted."""
@@ -278,7 +278,7 @@ def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
     return marked, RoundEvidence(behind={n: tuple(map(float, blocks)) for n, blocks in behind.items()}, lost=lost)
 
 
-def simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:
+def simplest_first(verdicts: list[Verdict], before: Trial) -> tuple[list[Verdict], tuple[Rival, ...]]:
     """The candidates with the chosen one of several ties first, and the evidence of the ties.
 
     Short segments hide slow errors, and leave hidden states free; so simulations along whole stretches decide.

@@ -111,9 +111,10 @@ class _LuGre(Effect):
         settling, bends = SETTLING_SHARE * scales.time_step, _bends(rate, scales)
         slow = (_SHARE_OF_RATE * rate, *(ratio * omega_s for omega_s in _AT_OUTPUT))
         shapes = [(omega_s, bend, _DAMPING) for omega_s in slow for bend in bends]
+        shapes.append((slow[0], bends[0], _MOSTLY_DAMPING))
         return tuple(
             cls(bend=bend, omega_s=omega_s, tau=damping / scales.natural_frequency, settling=settling)
-            for omega_s, bend, damping in (*shapes, (slow[0], bends[0], _MOSTLY_DAMPING))
+            for omega_s, bend, damping in shapes
         )
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:

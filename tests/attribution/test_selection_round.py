@@ -119,7 +119,7 @@ def test_whole_stretches_decide_between_tied_candidates(
         return None if None in gains else gains
 
     monkeypatch.setattr(attribution, "long_gains", long_gains)
-    ordered, _ = attribution.simplest_first(tied, before, STUDY)
+    ordered, _ = attribution.simplest_first(tied, before)
     assert ordered[0].name == leader
 
 
@@ -139,7 +139,7 @@ def test_form_with_memory_leads_only_with_a_gain_over_whole_stretches(
     ]
     long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
     monkeypatch.setattr(attribution, "long_gains", lambda before, trials: [long[id(t)] for t in trials])
-    (first, second), rivals = attribution.simplest_first(ordered, before, STUDY)
+    (first, second), rivals = attribution.simplest_first(ordered, before)
     assert {r.name: r.long_gain for r in rivals} == {"torque_bias": 2.0, "creep": creep_long}
     assert (first.name, first.separable, second.separable) == (leader, False, True)
 
@@ -155,7 +155,7 @@ def test_form_without_memory_is_preferred_at_equal_parameter_count(verdicts, mon
 
     dahl, dry = DahlMotorFriction(T_c=0.1, bend=0.1, settling=1e-3), MotorFriction(T_c=0.1, transition=0.1)
     assert len(effect_paths(dahl)) == len(effect_paths(dry))
-    ordered, _ = attribution.simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, STUDY)
+    ordered, _ = attribution.simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial)
     assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 

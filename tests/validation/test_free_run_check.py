@@ -83,6 +83,7 @@ def test_error_of_runs_that_diverge_is_infinite():
         (10.0, 3.2, False),  # nine tenths of the variance beyond the noise
         (10.0, 4.0, True),
         (1.5, 1.4, True),
+        (0.9, 1.4, True),  # the base model leaves nothing beyond the noise
         (np.inf, 50.0, False),
         (np.inf, np.inf, False),
         (10.0, np.inf, True),
@@ -96,6 +97,7 @@ def test_free_runs_are_checked_only_where_effects_leave_unexplained_error(
     noise = NOISE**2 * jnp.eye(1)
     share = share_explained(then, now, replace(found, covariance=noise), noise)
     assert (share is not None and share < RULES.free_run_explained) == asked
+    assert share is None or -1.0 <= share <= 1.0
 
 
 def test_free_runs_of_the_true_model_agree_with_their_bands(fitted: tuple[Fit, Account]):
