@@ -77,7 +77,10 @@ def rig_of(
         raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
     stated = drive_file.torque_hold
     holds = HOLDS if stated is None or other_holds else (stated,)
-    parts = [parted(log, drive_file, share=0.0 if test else TEST_SHARE) for log in logs]
+    parts, zeros = [], []
+    for log in logs:
+        parts.append(parted(log, drive_file, share=0.0 if test else TEST_SHARE, zeros=zeros))
+        zeros += [parts[-1][0].zero] if parts[-1][0].zero not in zeros else []
     findings = {}
     for known, _ in parts:
         findings[known.name] = examine(known, drive_file)
@@ -85,7 +88,9 @@ def rig_of(
     for log in test:
         findings[log.name] = examine(log, drive_file)
     fitted = tuple(known for known, _ in parts)
-    tests = [whole_test_log(log, drive_file) for log in test] or [end for _, end in parts if end is not None]
+    tests = [whole_test_log(log, drive_file, zeros=zeros) for log in test] or [
+        end for _, end in parts if end is not None
+    ]
     # The end of a log keeps its clock.
     starts = {log.name: float(log.time[0]) for log in (*fitted, *test)}
     return Rig(
@@ -157,9 +162,9 @@ def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = 
     return ready(read_log(path, drive_file, outputs_until=outputs_until), drive_file)
 
 
-def ready(log: Log, drive_file: DriveFile) -> Log:
-    """The log with invalid samples masked and its dynamic error zeroed."""
-    return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file)
+def ready(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
+    """The log with invalid samples masked and its dynamic error zeroed, if possible with a zero of other logs."""
+    return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file, known=zeros)
 
 
 def base_model(drive_file: DriveFile, log: Log) -> Model:

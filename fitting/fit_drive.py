@@ -9,7 +9,7 @@ from fitting.estimation.base_fit import BaseFit, base_fit, is_held
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
-from fitting.estimation.sample_rate import refined_intervals, with_intervals
+from fitting.estimation.recalibration import recalibrated
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import FitOnly
 from fitting.progress import Progress, silent
@@ -96,15 +96,14 @@ def _base(
     test: Mapping[Hold, tuple[Experiment, ...]],
     hold: Hold | None,
 ) -> tuple[Hold, BaseFit, Mapping[Hold, tuple[Experiment, ...]], Mapping[Hold, tuple[Experiment, ...]]]:
-    """The base fit under the stated or the best hold; and the data with refined values of uncertain sample
-    intervals."""
+    """The base fit under the stated or the best hold; and the data with refined constants of the logs."""
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
     hold = min(holds, key=lambda h: fits[h].fit.objective)
-    factors = refined_intervals(fits[hold].fit)
-    if not factors:
+    again = recalibrated(fits[hold].fit, experiments, test)
+    if again is None:
         return hold, fits[hold], experiments, test
-    experiments, test = with_intervals(experiments, factors), with_intervals(test, factors)
+    experiments, test = again
     return hold, base_fit(model, whole(experiments[hold])), experiments, test
 
 

@@ -22,7 +22,7 @@ from fitting.estimation.base_fit import need_double_precision
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, Stretch, split, whole
 from fitting.estimation.free_run import FreeRun, rms_error
-from fitting.estimation.sample_rate import refined_intervals, with_intervals
+from fitting.estimation.recalibration import recalibrated
 from fitting.estimation.whole_log_fit import refitted_on_all
 from fitting.one_side_check import source_of
 from fitting.outcome import Finding, Loop
@@ -67,9 +67,8 @@ def close_loop(
     clock = Clock()
     progress("computing starting values")
     base, read = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)
-    factors = refined_intervals(base.training)
-    if factors:
-        experiments, test = with_intervals(experiments, factors), with_intervals(test or {}, factors)
+    if (again := recalibrated(base.training, experiments, test or {})) is not None:
+        experiments, test = again
         base, read = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)
     setting = replace(read.setting, thorough=search.thorough)
     read = replace(read, setting=setting, seed=search.seed, progress=progress)

@@ -87,7 +87,7 @@ class FitOnly(eqx.Module):
     @property
     def stored(self) -> StoredModel:
         """The model, as `model.json` has it."""
-        return StoredModel(self.account.model, self.hold, self.goodness.substeps, 0, self.noise)
+        return StoredModel(self.account.model, self.hold, self.goodness.substeps, 0, self.noise, self.account.zeros)
 
     @property
     def before(self) -> Account:
@@ -171,7 +171,9 @@ class Loop(eqx.Module):
     @property
     def stored(self) -> StoredModel:
         """The final model, as `model.json` has it."""
-        return StoredModel(self.after.model, self.hold, self.after_substeps, self.setting.halo, self.noise)
+        return StoredModel(
+            self.after.model, self.hold, self.after_substeps, self.setting.halo, self.noise, self.after.zeros
+        )
 
     @property
     def unknown_remains(self) -> bool:

@@ -47,6 +47,7 @@ class StoredModel(eqx.Module):
         substeps: solver steps in a sample interval.
         halo: intervals of torque before the start, for delays.
         noise: covariance of the measurement noise of the outputs.
+        zeros: what was subtracted from the dynamic error of the logs, each value once.
     """
 
     model: Model
@@ -54,6 +55,7 @@ class StoredModel(eqx.Module):
     substeps: int = eqx.field(static=True)
     halo: int = eqx.field(static=True)
     noise: Float[Array, "outputs outputs"]
+    zeros: tuple[float, ...] = eqx.field(static=True, default=())
 
     def simulate(self, torque: Float[Array | np.ndarray, " n"], times: Float[Array | np.ndarray, " n"]) -> Trajectory:
         """Simulate the drive under a sampled torque, from rest.
@@ -80,6 +82,7 @@ def to_json(stored: StoredModel) -> str:
         "substeps": stored.substeps,
         "halo": stored.halo,
         "noise_covariance": np.asarray(stored.noise).tolist(),
+        "zeros": list(stored.zeros),
     }
     return json.dumps(content, indent=1, allow_nan=False)
 
@@ -213,4 +216,7 @@ def _stored(content: Any) -> StoredModel:
     substeps, halo = int(content["substeps"]), int(content["halo"])
     if substeps < 1 or halo < 0:
         raise ValueError(f"substeps is {substeps} and halo is {halo}")
-    return StoredModel(model, content["torque_hold"], substeps, halo, noise)
+    zeros = tuple(float(zero) for zero in content.get("zeros", ()))
+    if not np.all(np.isfinite(zeros)):
+        raise ValueError(f"zeros are {zeros}")
+    return StoredModel(model, content["torque_hold"], substeps, halo, noise, zeros)

@@ -311,6 +311,13 @@ class TwoInertiaModel(Model):
         return taylor(moving, ahead), taylor(moving[1:], ahead)
 
     def _torque_as_read(self, state: State, inputs: Inputs | None) -> Array:
+        """Reading of the joint torque's sensor."""
+        tau = self._late_torque(state, inputs)
+        for effect in self._of(SensorEffect):
+            tau = effect.torque_reading(tau)
+        return tau
+
+    def _late_torque(self, state: State, inputs: Inputs | None) -> Array:
         """The mesh torque when its sensor is read: Taylor's series to the fourth order in the delay. The first order is
         that of all effects; the others are those of the bare drive from its twist's acceleration on, under a steady
         torque."""

@@ -30,11 +30,12 @@ SCALES = Scales(
 
 def stored(model: Model, hold: str = "zero-order") -> StoredModel:
     noise = jnp.asarray([[1.1e-12, 3e-13], [3e-13, 0.9e-12]]) if isinstance(model, TwoInertiaModel) else jnp.eye(1)
-    return StoredModel(model, hold, 3, 7, noise)
+    return StoredModel(model, hold, 3, 7, noise, (0.0, 1.0 / 3.0))
 
 
 def assert_same(found: StoredModel, wanted: StoredModel):
-    assert (found.hold, found.substeps, found.halo) == (wanted.hold, wanted.substeps, wanted.halo)
+    settings = [(one.hold, one.substeps, one.halo, one.zeros) for one in (found, wanted)]
+    assert settings[0] == settings[1]
     np.testing.assert_array_equal(found.noise, wanted.noise)
     assert type(found.model) is type(wanted.model)
     assert [type(e) for e in found.model.effects] == [type(e) for e in wanted.model.effects]

@@ -1,6 +1,6 @@
 """The logs of one drive, from files or from tables in memory."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -64,12 +64,13 @@ class Data:
         """The prepared logs; arguments as in `fitting.drive_data.rig_of`."""
         return rig_of(self.logs, self.drive, test=self.test, other_holds=other_holds)
 
-    def ready(self, log: Log, *, outputs_until: int | None = None) -> Log:
-        """A log, masked and zeroed by outputs known so far; see `fitting.logs.log.read_log`."""
+    def ready(self, log: Log, *, outputs_until: int | None = None, zeros: Sequence[float] = ()) -> Log:
+        """A log, masked and zeroed by outputs known so far; see `fitting.logs.log.read_log` and
+        `fitting.logs.zeroing.zeroed`."""
         table = self.tables.get(log.path)
         if outputs_until != self.outputs_until:
             log = replace(read_log(log.path, self.drive, outputs_until=outputs_until, table=table), name=log.name)
-        return ready(log, self.drive)
+        return ready(log, self.drive, zeros=zeros)
 
     @property
     def table(self) -> "pl.DataFrame":

@@ -125,7 +125,7 @@ def predict(model: AnyModel, data: Data) -> Prediction:
     if len(data.logs) != 1:
         raise InputError(f"a prediction follows one log, but there are {len(data.logs)}; load it alone")
     stored, name = _stored(model)
-    log = data.ready(data.logs[0], outputs_until=WINDOW)
+    log = data.ready(data.logs[0], outputs_until=WINDOW, zeros=stored.zeros)
     known = None
     if data.outputs_until is None:
         known = replace(counted_from(masked(data.logs[0]), log.zero), pieces=None)

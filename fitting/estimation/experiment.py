@@ -52,6 +52,7 @@ class Experiment(Record):
         origin: start of the log, on the clock of `time` [s].
         log: the name of the log that it is a part of.
         rate_std: relative standard deviation of the sample interval, from the rounding of the log's stamps.
+        zero: what was subtracted from its dynamic error, see [`fitting.logs.zeroing`][].
         outputs: names of the measured outputs, see `hdjax.dynamics.OUTPUTS`.
         moved: times by which readings are from later rows, see [`fitting.estimation.late_readings`][].
         shaft_torques: unit torques on a shaft whose estimated strengths are part of the torques, or None, see
@@ -70,6 +71,7 @@ class Experiment(Record):
     origin: float = eqx.field(static=True, default=0.0)
     log: str = eqx.field(static=True, default="")
     rate_std: float = eqx.field(static=True, default=0.0)
+    zero: float = eqx.field(static=True, default=0.0)
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
     moved: Moved = eqx.field(static=True, default=Moved())
     shaft_torques: Float[np.ndarray, "n torques"] | None = None
@@ -185,6 +187,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         origin=float(log.time[0]),
         log=log.name,
         rate_std=log.rate_std,
+        zero=log.zero,
         outputs=outputs,
     )
 

@@ -1,5 +1,6 @@
 """The test part of a log, cut off when it is read, so that no fit, selection or check uses it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from fitting.errors import DataError
@@ -16,13 +17,16 @@ TEST_SHARE = 0.2
 _FEWEST = 2 * WINDOW
 
 
-def parted(log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE) -> tuple[Log, Log | None]:
+def parted(
+    log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE, zeros: Sequence[float] = ()
+) -> tuple[Log, Log | None]:
     """A log without its test part, prepared for a fit, and the test part.
 
     Args:
         log: as read.
         drive_file: for the load's inertia.
         share: of the log that is test data; 0 where test logs are named.
+        zeros: of the twist, in other logs of the drive.
 
     Returns:
         Both parts masked, with the zero offsets of the first; no test part where it would be too short to estimate an
@@ -30,8 +34,8 @@ def parted(log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE) -> tup
     """
     border = len(log) - round(share * len(log))
     if share <= 0.0 or len(log) - border < _FEWEST:
-        return zeroed(masked(log), drive_file), None
-    known = zeroed(masked(log.rows(0, border)), drive_file)
+        return zeroed(masked(log), drive_file, known=zeros), None
+    known = zeroed(masked(log.rows(0, border)), drive_file, known=zeros)
     end = log.rows(border, len(log))
     if end.pieces == ():
         return known, None
@@ -42,12 +46,17 @@ def parted(log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE) -> tup
     return known, counted_from(end, known.zero)
 
 
-def whole_test_log(log: Log, drive_file: DriveFile) -> Log:
-    """A log that is test data as a whole. Its zero offsets are those of the free run's initial-state window.
+def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
+    """A log that is test data as a whole. Its zero offset is from the free run's initial-state window alone.
+
+    Args:
+        log: as read.
+        drive_file: for the load's inertia.
+        zeros: of the twist, in the fitted logs.
 
     Raises:
         DataError: too few valid outputs.
     """
     ready = masked(log)
-    zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file).zero
+    zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file, known=zeros).zero
     return counted_from(ready, zero)

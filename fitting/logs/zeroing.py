@@ -1,12 +1,16 @@
 """Zero of the twist, in a log whose two sensors were not zeroed together."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
+
+_Severity = Literal["note", "warning"]
 
 LARGEST_TWIST = 0.02  # rad, more than any gear's twist, assumed
 _OFFSET = 3.0  # standard deviations, assumed
@@ -16,43 +20,32 @@ _EVEN = 0.2
 _FEWEST = 25
 
 
-def zeroed(log: Log, drive_file: DriveFile) -> Log:
+def zeroed(log: Log, drive_file: DriveFile, *, known: Sequence[float] = ()) -> Log:
     """The log with its dynamic error relative to the relaxed spring.
 
     A mean twist needs a mean torque, and no gear twists by more than a degree. An offset that neither explains is due
-    to the sensors, and is subtracted. A smaller one is confounded with a load, and is kept.
+    to the sensors, and is subtracted. A smaller one may be a load's as well, and is kept.
 
     Args:
         log: as read and masked.
         drive_file: for the load's inertia.
+        known: zeros of other logs of the drive; the first one that explains the offset is taken.
 
     Returns:
         The log with its `zero`, and a finding if it was shifted.
     """
     if log.dynamic_error is None:
         return log
-    with np.errstate(all="ignore"):
-        known = slice(log.outputs_until) if log.trusted is None else log.trusted[: log.outputs_until]
-        x = log.dynamic_error[: log.outputs_until][known]
-        middle, spread = float(np.median(x)), float(np.std(x))
-        torque = log.motor_torque if log.forcing is None else log.forcing
-        assert torque is not None
-        most = drive_file.largest_twist or LARGEST_TWIST
-        impossible = log.kind == "drive" and abs(middle) > max(most, _OFFSET * spread)
-        balanced = abs(float(np.mean(torque))) < _NO_MEAN * float(np.std(torque)) and log.load_torque is None
-        unexplained = balanced and abs(middle) > _OFFSET * spread > 0 and log.outputs_until is None
-        if not (impossible or unexplained):
-            return log
-        offset = _relaxed(log, torque, drive_file.load_inertia, middle)
-    unit = log.units["dynamic_error"]
-    finding = Finding(
-        "note" if unexplained else "warning",
-        f"the dynamic error is {middle:.4g} {unit} off zero on average and varies by {spread:.3g} {unit} rms",
-        "dynamic_error",
-        f"the sensors were not zeroed together, so that {offset:.7g} {unit} was subtracted"
-        + ("" if unexplained else "; a constant load has the same effect, so that alpha may be that around this point"),
+    likely = [zero for zero in (*known, 0.0) if _objection(log, zero, drive_file) is None]
+    if likely:
+        return _shifted(log, likely[0], "note", ", as from another log") if likely[0] else log
+    severity = _objection(log, 0.0, drive_file) or "note"
+    aside = (
+        ""
+        if severity == "note"
+        else "; a constant load has the same effect, so that alpha may be that around this point"
     )
-    return replace(counted_from(log, offset), findings=(*log.findings, finding))
+    return _shifted(log, _relaxed(log, drive_file.load_inertia), severity, aside)
 
 
 def counted_from(log: Log, zero: float) -> Log:
@@ -60,12 +53,55 @@ def counted_from(log: Log, zero: float) -> Log:
     return log if log.dynamic_error is None else replace(log, dynamic_error=log.dynamic_error - zero, zero=zero)
 
 
-def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: float) -> float:
+def _objection(log: Log, zero: float, drive_file: DriveFile) -> _Severity | None:
+    """Why a value is not the zero of the dynamic error: "note" where nothing explains the mean from there, "warning"
+    where only a constant load does; None where it may be."""
+    torque = _input(log)
+    with np.errstate(all="ignore"):
+        middle, spread = _middle_and_spread(log)
+        off = abs(middle - zero)
+        balanced = abs(float(np.mean(torque))) < _NO_MEAN * float(np.std(torque)) and log.load_torque is None
+        if balanced and off > _OFFSET * spread > 0 and log.outputs_until is None:
+            return "note"
+        impossible = log.kind == "drive" and off > max(drive_file.largest_twist or LARGEST_TWIST, _OFFSET * spread)
+        return "warning" if impossible else None
+
+
+def _shifted(log: Log, zero: float, severity: _Severity, aside: str) -> Log:
+    """The log relative to a zero, with a finding."""
+    middle, spread = _middle_and_spread(log)
+    unit = log.units["dynamic_error"]
+    finding = Finding(
+        severity,
+        f"the dynamic error is {middle:.4g} {unit} off zero on average and varies by {spread:.3g} {unit} rms",
+        "dynamic_error",
+        f"the sensors were not zeroed together, so that {zero:.7g} {unit} was subtracted{aside}",
+    )
+    return replace(counted_from(log, zero), findings=(*log.findings, finding))
+
+
+def _middle_and_spread(log: Log) -> tuple[float, float]:
+    """Median and standard deviation of the dynamic error, where it is known."""
+    assert log.dynamic_error is not None
+    known = slice(log.outputs_until) if log.trusted is None else log.trusted[: log.outputs_until]
+    x = log.dynamic_error[: log.outputs_until][known]
+    return float(np.median(x)), float(np.std(x))
+
+
+def _input(log: Log) -> np.ndarray:
+    torque = log.motor_torque if log.forcing is None else log.forcing
+    assert torque is not None
+    return torque
+
+
+@np.errstate(all="ignore")
+def _relaxed(log: Log, load_inertia: float | None) -> float:
     """The twist at which the spring's torque vanishes: the root of a cubic that is fitted with the equation of motion.
 
     Weak form as for the starting values: the load's equation J_l theta_l'' = p(x) + B x', or that of the reduced drive
     with b u on its right, multiplied by test functions and integrated by parts.
     """
+    middle, _ = _middle_and_spread(log)
     best, root = np.inf, middle
     x = log.twist - middle
     for width in _WIDTHS:
@@ -88,7 +124,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
             rows = [*spring, -against(x, slope)]
             right = (load_inertia or 1.0) * against(log.load_angle - log.load_angle[0], curvature)
         else:
-            rows = [*spring, -against(x, slope), -against(torque, bump)]
+            rows = [*spring, -against(x, slope), -against(_input(log), bump)]
             right = -against(x, curvature)
         matrix = np.stack(rows, axis=1)
         norm = np.linalg.norm(matrix, axis=0)

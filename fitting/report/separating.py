@@ -115,6 +115,15 @@ _SEPARATING = {
     "frequency shows the stiffness, the decay the damping, the torque the friction.",
     ("encoder_eccentricity", "encoder_eccentricity"): "Turn the output by more than one revolution: the load's encoder "
     "repeats with it, the motor's with the motor.",
+    (
+        "encoder_offset",
+        "encoder_eccentricity",
+    ): "Turn the output by more than one revolution: an offset is constant, an eccentric disc's error repeats.",
+    ("encoder_offset", "torque_sensor"): "Release the drive without load: an encoder's offset remains, a torque's bias "
+    "twists nothing.",
+    ("encoder_offset", "load_disturbance"): "Release the drive without load: an encoder's offset remains.",
+    ("encoder_offset", "gravity_load"): "Turn the mount: gravity follows, an encoder's offset does not.",
+    ("encoder_offset", "hysteresis"): "Reverse a large torque: hysteresis changes the twist at rest, an offset stays.",
     ("motor_friction", "gravity_load"): "Run the same path in both directions: friction changes its sign, gravity does "
     "not.",
     (
@@ -151,6 +160,7 @@ _REVEALING = {
     "inertia_error": "add a known inertia and record again",
     "torque_sensor": "reverse the direction, and check the sensor with a known torque",
     "input_delay": "excite up to several times the natural frequency",
+    "encoder_offset": "release the drive without load: the reading that is left is the offset",
     "encoder_eccentricity": "pass slowly through the natural frequency",
     "sensor_delay": "move the unloaded drive slowly to and fro: all sensors must show the same motion",
     "creep": "stop under load and wait for minutes",

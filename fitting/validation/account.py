@@ -28,6 +28,7 @@ class Account(eqx.Module):
         test: free runs along the test data; none where there are too few.
         identifiability: which parameters the logs don't determine.
         not_machine_code: reason why XLA evaluates its residual; None where machine code does.
+        zeros: what was subtracted from the dynamic error of its logs, each value once.
     """
 
     model: Model
@@ -37,6 +38,7 @@ class Account(eqx.Module):
     test: tuple[FreeRun, ...]
     identifiability: Identifiability
     not_machine_code: str | None = eqx.field(static=True, default=None)
+    zeros: tuple[float, ...] = eqx.field(static=True, default=())
 
     def parts(self) -> dict[str, tuple[FreeRun, ...]]:
         """The free runs of each part of the data, by its name."""
@@ -84,7 +86,8 @@ def account(
     # Separate runs, so that test data do not share the scale of a window.
     seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
     found, told = of_parameters(fit) if known is None else known
-    return Account(unaligned(fit.model), found, seen, selection, unseen, told, why_not(fit.problem))
+    zeros = tuple(dict.fromkeys(stretch.experiment.zero for stretch in training))
+    return Account(unaligned(fit.model), found, seen, selection, unseen, told, why_not(fit.problem), zeros)
 
 
 def of_parameters(

@@ -45,6 +45,8 @@ from hdjax.effects.position import (
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import (
+    EncoderOffset,
+    JointTorqueBias,
     JointTorqueDelay,
     LoadEncoderDelay,
     LoadEncoderEccentricity,
@@ -74,11 +76,13 @@ __all__ = [
     "DisplacementDamping",
     "DryFriction",
     "Effect",
+    "EncoderOffset",
     "ExtraResonance",
     "FAMILIES",
     "GravityLoad",
     "InputDelay",
     "InputLag",
+    "JointTorqueBias",
     "JointTorqueDelay",
     "KinematicError",
     "KinematicHarmonic",

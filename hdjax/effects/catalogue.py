@@ -32,6 +32,8 @@ from hdjax.effects.position import (
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import (
+    EncoderOffset,
+    JointTorqueBias,
     JointTorqueDelay,
     LoadEncoderDelay,
     LoadEncoderEccentricity,
@@ -65,6 +67,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     KinematicSidebands,
     TorqueBias,
     TorqueGain,
+    JointTorqueBias,
     MotorInertiaError,
     LoadInertiaError,
     InputDelay,
@@ -95,6 +98,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     ThermalStiffness,
     ThermalDamping,
     ThermalMotorFriction,
+    EncoderOffset,
     MotorEncoderEccentricity,
     LoadEncoderEccentricity,
 )

@@ -271,13 +271,17 @@ class MeshGeometryEffect(Effect):
 
 
 class SensorEffect(Effect):
-    """Changes the encoders' readings, and no force."""
+    """Changes the sensors' readings, and no force."""
 
     needs_motor: ClassVar[bool] = True
 
     @abc.abstractmethod
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         """Readings of the motor's and the load's encoder [rad] at the true angles [rad] and rates [rad/s]."""
+
+    def torque_reading(self, tau: Array) -> Array:
+        """Reading of the joint torque's sensor [N m] at the true torque [N m]."""
+        return tau
 
     def load_delay(self) -> Array | None:
         """Time by which the load's encoder is read later than the motor's [s]; None where they are read together."""

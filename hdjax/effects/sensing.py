@@ -1,4 +1,4 @@
-"""Errors of the sensors: eccentric disc, delay."""
+"""Errors of the sensors: zero offset, eccentric disc, delay."""
 
 from typing import ClassVar
 
@@ -13,6 +13,47 @@ from hdjax.signals import PiecewisePolynomial
 
 SOURCE = "EFFECTS: 10 um on a disc of 25 to 50 mm are 40 to 80 arcsec"
 _PLAUSIBLE = (1.9e-4, 3.9e-4)
+
+
+class EncoderOffset(SensorEffect):
+    """The load's encoder reads `theta_l + offset`: the two encoders were not zeroed with the spring relaxed; no force
+    changes."""
+
+    family: ClassVar[str] = "encoder_offset"
+    name: ClassVar[str] = "encoder_offset"
+
+    offset: Scalar = parameter(
+        0.0,
+        unit="rad",
+        doc="reading of the load's encoder where the spring is relaxed and the motor at zero",
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
+        return theta_m, theta_l + self.offset
+
+
+class JointTorqueBias(SensorEffect):
+    """The sensor of the joint torque has a zero offset: it reads `tau + bias`."""
+
+    family: ClassVar[str] = "torque_sensor"
+    name: ClassVar[str] = "joint_torque_bias"
+
+    bias: Scalar = parameter(0.0, unit="N m", doc="reading of the sensor without a torque", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
+        return theta_m, theta_l
+
+    def torque_reading(self, tau: Array) -> Array:
+        return tau + self.bias
 
 
 class MotorEncoderEccentricity(SensorEffect):

@@ -24,6 +24,7 @@ SIGNATURES: dict[str, str] = {
     "extra_resonance": "A zero and a pole at fixed frequencies; they need excitation and move with the load's inertia.",
     "temperature": "Stiffness, damping or friction drifts with the temperature channel.",
     "sensor_delay": "The residual of one output is proportional to its rate, whatever the torque.",
+    "encoder_offset": "The dynamic error is off by a constant that no torque explains.",
     "encoder_eccentricity": "One or two cycles per revolution of an encoder, without a force: the natural frequency "
     "does not amplify them.",
 }

@@ -1,5 +1,6 @@
 """Effects of angles, rates, time and temperature against the equations of EFFECTS.md, solved by scipy."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -20,7 +21,7 @@ from hdjax.effects.position import (
     PositionDependentMotorFriction,
     PositionDependentStiffness,
 )
-from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
+from hdjax.effects.sensing import EncoderOffset, JointTorqueBias, LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.effects.stiffness import SmoothKneeStiffness, ThreeSlopeStiffness
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
@@ -150,6 +151,14 @@ def test_encoder_eccentricity_changes_outputs_and_not_the_motion():
         np.testing.assert_allclose(model.outputs(state), [motor / N, motor / N - load], atol=1e-15)
         nothing = jnp.zeros(())
         np.testing.assert_array_equal(model.rates(state, nothing, nothing), BASE.rates(state, nothing, nothing))
+
+
+def test_offsets_of_sensors_change_readings_and_not_the_motion():
+    model = replace(BASE, measured=("dynamic_error", "load_angle", "joint_torque"))
+    shifted = model.with_effects(EncoderOffset(offset=3e-4), JointTorqueBias(bias=0.7))
+    read, nothing = np.asarray(model.outputs(START)), jnp.zeros(())
+    np.testing.assert_allclose(shifted.outputs(START), read + [-3e-4, 3e-4, 0.7], rtol=1e-14)
+    np.testing.assert_array_equal(shifted.rates(START, nothing, nothing), BASE.rates(START, nothing, nothing))
 
 
 def test_narrow_smooth_knee_equals_three_slope_stiffness():

@@ -65,6 +65,17 @@ def test_offset_that_a_motor_torque_explains_is_not_removed():
     assert zeroed(held, DRIVE) is held
 
 
+def test_logs_of_one_drive_share_a_zero_where_it_explains_their_offset():
+    first, second = (with_offset(drive_log(seed), 0.7) for seed in (0, 1))
+    zero = zeroed(first, DRIVE).zero
+    assert zeroed(second, DRIVE, known=[zero]).zero == zero
+    # Of a log for a prediction, 50 samples tell far less of the zero.
+    assert zeroed(replace(second, outputs_until=50), DRIVE, known=[zero]).zero == zero
+    assert zeroed(drive_log(1), DRIVE, known=[zero]).zero == 0.0
+    moved = zeroed(with_offset(drive_log(1), -0.2), DRIVE, known=[zero])
+    assert moved.zero == pytest.approx(-0.2, abs=1e-7)
+
+
 def test_masked_samples_do_not_change_the_zero():
     log = with_offset(drive_log(), 0.7)
     spoilt = log.dynamic_error.copy()

@@ -34,7 +34,7 @@ KNOWN_FAMILIES = {
     "kinematic_error", "stiffness_shape", "backlash", "hysteresis", "coulomb_friction", "motor_friction",
     "load_friction", "nonlinear_damping", "position_dependent_stiffness", "position_dependent_friction", "cogging",
     "gravity_load", "load_disturbance", "extra_resonance", "temperature", "torque_sensor", "input_delay",
-    "encoder_eccentricity", "sensor_delay", "creep", "inertia_error", "unknown",
+    "encoder_eccentricity", "encoder_offset", "sensor_delay", "creep", "inertia_error", "unknown",
 }  # fmt: skip
 
 
