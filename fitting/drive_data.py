@@ -80,7 +80,7 @@ def rig_of(
     parts, zeros = [], []
     for log in logs:
         parts.append(parted(log, drive_file, share=0.0 if test else TEST_SHARE, zeros=zeros))
-        zeros += [parts[-1][0].zero] if parts[-1][0].zero not in zeros else []
+        zeros.append(parts[-1][0].zero)
     findings = {}
     for known, _ in parts:
         findings[known.name] = examine(known, drive_file)

@@ -39,13 +39,11 @@ def zeroed(log: Log, drive_file: DriveFile, *, known: Sequence[float] = ()) -> L
     likely = [zero for zero in (*known, 0.0) if _objection(log, zero, drive_file) is None]
     if likely:
         return _shifted(log, likely[0], "note", ", as from another log") if likely[0] else log
-    severity = _objection(log, 0.0, drive_file) or "note"
-    aside = (
-        ""
-        if severity == "note"
-        else "; a constant load has the same effect, so that alpha may be that around this point"
-    )
-    return _shifted(log, _relaxed(log, drive_file.load_inertia), severity, aside)
+    relaxed = _relaxed(log, drive_file.load_inertia)
+    if _objection(log, 0.0, drive_file) == "note":
+        return _shifted(log, relaxed, "note", "")
+    aside = "; a constant load has the same effect, so that alpha may be that around this point"
+    return _shifted(log, relaxed, "warning", aside)
 
 
 def counted_from(log: Log, zero: float) -> Log:

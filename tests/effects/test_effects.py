@@ -13,7 +13,7 @@ from simulated_outputs import BASE, START, STEP, TIME, TORQUE, outputs, rms, slo
 import hdjax.effects
 from fitting.estimation.problem import stable_substeps
 from hdjax import TwoInertiaModel, sampled
-from hdjax.effects import CATALOGUE, JointTorqueDelay, Scales
+from hdjax.effects import CATALOGUE, JointTorqueBias, JointTorqueDelay, Scales
 from hdjax.effects.creep import Creep
 from hdjax.effects.hysteresis import BoucWen, SharpBoucWen
 from hdjax.effects.position import ConservativePositionDependentStiffness
@@ -24,7 +24,8 @@ from hdjax.simulate import march
 
 def base(form=None) -> TwoInertiaModel:
     """The base model with sensors that see what the form changes; the last output shows it."""
-    return replace(BASE, measured=("motor_turn", "joint_torque")) if form is JointTorqueDelay else BASE
+    of_torque = form in (JointTorqueBias, JointTorqueDelay)
+    return replace(BASE, measured=("motor_turn", "joint_torque")) if of_torque else BASE
 
 
 @functools.cache

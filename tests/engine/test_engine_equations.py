@@ -21,7 +21,7 @@ from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.learned import LEARNED, LEARNED_TORQUES, Learned, LearnedMeshTorque, LearnedMotorTorque
 from hdjax.effects.learned_axes import Axis, PeriodicAxis, SignAxis, axes_over
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY
-from hdjax.effects.sensing import JointTorqueDelay
+from hdjax.effects.sensing import JointTorqueBias, JointTorqueDelay
 from hdjax.effects.stiffness import QuadraticStiffness
 from hdjax.effects.thermal import ThermalStiffness
 from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, Part, equations, split_model
@@ -131,6 +131,7 @@ LATE = (
     ThermalStiffness(k_T=-1e-3, T_0=303.0),
     MotorFriction(T_c=0.02, transition=0.5),
     TorqueGain(gain_error=0.05),
+    JointTorqueBias(bias=0.3),
     JointTorqueDelay(delay=3e-4),
 )
 
