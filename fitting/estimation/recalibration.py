@@ -34,15 +34,16 @@ def recalibrated(found: Fit, *data: Data) -> list[dict[Hold, tuple[Experiment, .
 def remaining_offsets(found: Fit) -> dict[float, float]:
     """Mean residual of the dynamic error in the logs with each estimated zero; none where it is insignificant, or more
     is left than constants and white noise: then `encoder_offset` is one of several candidates."""
-    groups = np.array([stretch.experiment.zero for stretch in found.stretches])
+    zeros = [stretch.experiment.zero for stretch in found.stretches]
     error, weight = np.asarray(found.error).copy(), np.asarray(found.problem.segments.weight) > 0
     means = {}
-    for zero in np.unique(groups):
-        known = segments_of_logs(found)[groups == zero].any(axis=0)[:, None] & weight
+    for zero in set(zeros):
+        own = segments_of_logs(found)[[z == zero for z in zeros]]
+        known = np.any(own, axis=0)[:, None] & weight
         left = error[known, -1]
         error[known, -1] -= left.mean()
         if zero != 0.0 and abs(left.mean()) > _SEEN * left.std() / np.sqrt(left.size):
-            means[float(zero)] = float(left.mean())
+            means[zero] = float(left.mean())
     return means if means and leaves_white_noise(replace(found, error=jnp.asarray(error))) else {}
 
 
