@@ -127,7 +127,7 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
     if verdicts.get("normality") == "failed" and not missing:
         notes.append("The errors are not Gaussian: look for outliers, clipping or coarse quantisation in the plot.")
     if report["goodness"]["left_out"]:
-        notes.append(f"{report['goodness']['left_out']} samples were omitted: missing, or outliers.")
+        notes.append(f"Omitted samples, missing or outliers: {report['goodness']['left_out']}.")
     response = report["frequency_response"]
     if response and not response["excited"]:
         notes.append("The log does not excite the resonance: the damping is poorly determined.")
