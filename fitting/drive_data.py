@@ -164,7 +164,7 @@ def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = 
 
 def ready(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
     """The log with invalid samples masked and its dynamic error zeroed, if possible with a zero of other logs."""
-    return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file, known=zeros)
+    return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file, zeros=zeros)
 
 
 def base_model(drive_file: DriveFile, log: Log) -> Model:

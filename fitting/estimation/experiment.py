@@ -150,8 +150,6 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         DataError: the log is mostly a gap.
     """
     drive_log = log.kind == "drive"
-    input_samples = log.motor_torque if drive_log else log.forcing
-    assert input_samples is not None
     lasts = (log.time[-1] - log.time[0]) / np.median(np.diff(log.time))
     if lasts > _MOST_PUT_IN * len(log):
         raise DataError(
@@ -160,7 +158,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         )
     known = np.ones(len(log), dtype=bool) if log.input_known is None else log.input_known.copy()
     known[[0, -1]] = True
-    stamps, samples = bridged(log.time[known], input_samples[known])
+    stamps, samples = bridged(log.time[known], log.input[known])
     time, rows = _grid(log, stamps)
     torque = _on_grid(sampled(stamps, samples, hold=hold), time)
     # Commands of a digital drive are held between samples; measured torques are continuous and interpolated linearly.

@@ -36,10 +36,9 @@ def remaining_offsets(found: Fit) -> dict[float, float]:
     is left than constants and white noise: then `encoder_offset` is one of several candidates."""
     zeros = [stretch.experiment.zero for stretch in found.stretches]
     error, weight = np.asarray(found.error).copy(), np.asarray(found.problem.segments.weight) > 0
-    means = {}
+    segments, means = segments_of_logs(found), {}
     for zero in set(zeros):
-        own = segments_of_logs(found)[[z == zero for z in zeros]]
-        known = np.any(own, axis=0)[:, None] & weight
+        known = np.any(segments[[z == zero for z in zeros]], axis=0)[:, None] & weight
         left = error[known, -1]
         error[known, -1] -= left.mean()
         if zero != 0.0 and abs(left.mean()) > _SEEN * left.std() / np.sqrt(left.size):
@@ -60,6 +59,6 @@ def with_zeros(data: Data, offsets: Mapping[float, float]) -> dict[Hold, tuple[E
 def _less(experiment: Experiment, offset: float) -> Experiment:
     if offset == 0.0:
         return experiment
-    others = np.arange(experiment.measured.shape[1]) < experiment.measured.shape[1] - 1
-    measured = np.where(others, experiment.measured, experiment.measured - offset)
+    measured = experiment.measured.copy()
+    measured[:, -1] -= offset
     return replace(experiment, measured=measured, zero=experiment.zero + offset)

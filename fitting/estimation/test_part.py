@@ -34,8 +34,8 @@ def parted(
     """
     border = len(log) - round(share * len(log))
     if share <= 0.0 or len(log) - border < _FEWEST:
-        return zeroed(masked(log), drive_file, known=zeros), None
-    known = zeroed(masked(log.rows(0, border)), drive_file, known=zeros)
+        return zeroed(masked(log), drive_file, zeros=zeros), None
+    known = zeroed(masked(log.rows(0, border)), drive_file, zeros=zeros)
     end = log.rows(border, len(log))
     if end.pieces == ():
         return known, None
@@ -47,7 +47,8 @@ def parted(
 
 
 def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
-    """A log that is test data as a whole. Its zero offset is from the free run's initial-state window alone.
+    """A log that is test data as a whole. Its zero is that of a fitted log, if this suits the free run's initial-state
+    window; else it is estimated from that window.
 
     Args:
         log: as read.
@@ -58,5 +59,5 @@ def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = 
         DataError: too few valid outputs.
     """
     ready = masked(log)
-    zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file, known=zeros).zero
+    zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file, zeros=zeros).zero
     return counted_from(ready, zero)

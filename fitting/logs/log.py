@@ -107,6 +107,13 @@ class Log:
         return len(self.time)
 
     @property
+    def input(self) -> np.ndarray:
+        """The motor torque, or a reduced log's forcing, (n,)."""
+        found = self.motor_torque if self.kind == "drive" else self.forcing
+        assert found is not None
+        return found
+
+    @property
     def twist(self) -> np.ndarray:
         """The dynamic error of a log that has one, (n,)."""
         assert self.dynamic_error is not None

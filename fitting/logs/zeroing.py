@@ -20,7 +20,7 @@ _EVEN = 0.2
 _FEWEST = 25
 
 
-def zeroed(log: Log, drive_file: DriveFile, *, known: Sequence[float] = ()) -> Log:
+def zeroed(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
     """The log with its dynamic error relative to the relaxed spring.
 
     A mean twist needs a mean torque, and no gear twists by more than a degree. An offset that neither explains is due
@@ -29,14 +29,14 @@ def zeroed(log: Log, drive_file: DriveFile, *, known: Sequence[float] = ()) -> L
     Args:
         log: as read and masked.
         drive_file: for the load's inertia.
-        known: zeros of other logs of the drive; the first one that explains the offset is taken.
+        zeros: those of other logs of the drive; the first one that explains the offset is taken.
 
     Returns:
         The log with its `zero`, and a finding if it was shifted.
     """
     if log.dynamic_error is None:
         return log
-    likely = [zero for zero in (*known, 0.0) if _objection(log, zero, drive_file) is None]
+    likely = [zero for zero in (*zeros, 0.0) if _objection(log, zero, drive_file) is None]
     if likely:
         return _shifted(log, likely[0], "note", ", as from another log") if likely[0] else log
     relaxed = _relaxed(log, drive_file.load_inertia)
@@ -54,11 +54,10 @@ def counted_from(log: Log, zero: float) -> Log:
 def _objection(log: Log, zero: float, drive_file: DriveFile) -> _Severity | None:
     """Why a value is not the zero of the dynamic error: "note" where nothing explains the mean from there, "warning"
     where only a constant load does; None where it may be."""
-    torque = _input(log)
     with np.errstate(all="ignore"):
         middle, spread = _middle_and_spread(log)
         off = abs(middle - zero)
-        balanced = abs(float(np.mean(torque))) < _NO_MEAN * float(np.std(torque)) and log.load_torque is None
+        balanced = abs(float(np.mean(log.input))) < _NO_MEAN * float(np.std(log.input)) and log.load_torque is None
         if balanced and off > _OFFSET * spread > 0 and log.outputs_until is None:
             return "note"
         impossible = log.kind == "drive" and off > max(drive_file.largest_twist or LARGEST_TWIST, _OFFSET * spread)
@@ -80,16 +79,9 @@ def _shifted(log: Log, zero: float, severity: _Severity, aside: str) -> Log:
 
 def _middle_and_spread(log: Log) -> tuple[float, float]:
     """Median and standard deviation of the dynamic error, where it is known."""
-    assert log.dynamic_error is not None
     known = slice(log.outputs_until) if log.trusted is None else log.trusted[: log.outputs_until]
-    x = log.dynamic_error[: log.outputs_until][known]
+    x = log.twist[: log.outputs_until][known]
     return float(np.median(x)), float(np.std(x))
-
-
-def _input(log: Log) -> np.ndarray:
-    torque = log.motor_torque if log.forcing is None else log.forcing
-    assert torque is not None
-    return torque
 
 
 @np.errstate(all="ignore")
@@ -122,7 +114,7 @@ def _relaxed(log: Log, load_inertia: float | None) -> float:
             rows = [*spring, -against(x, slope)]
             right = (load_inertia or 1.0) * against(log.load_angle - log.load_angle[0], curvature)
         else:
-            rows = [*spring, -against(x, slope), -against(_input(log), bump)]
+            rows = [*spring, -against(x, slope), -against(log.input, bump)]
             right = -against(x, curvature)
         matrix = np.stack(rows, axis=1)
         norm = np.linalg.norm(matrix, axis=0)

@@ -275,9 +275,9 @@ class SensorEffect(Effect):
 
     needs_motor: ClassVar[bool] = True
 
-    @abc.abstractmethod
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         """Readings of the motor's and the load's encoder [rad] at the true angles [rad] and rates [rad/s]."""
+        return theta_m, theta_l
 
     def torque_reading(self, tau: Array) -> Array:
         """Reading of the joint torque's sensor [N m] at the true torque [N m]."""

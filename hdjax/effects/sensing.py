@@ -49,9 +49,6 @@ class JointTorqueBias(SensorEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return (cls(),)
 
-    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
-        return theta_m, theta_l
-
     def torque_reading(self, tau: Array) -> Array:
         return tau + self.bias
 
@@ -150,9 +147,6 @@ class SensorDelay(SensorEffect):
         """A delay of whole rows between the sides."""
         late = cls.of_load * scales.load_late
         return (({}, cls(delay=late)),) if late > 0.0 else ()
-
-    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
-        return theta_m, theta_l
 
     def load_delay(self) -> Array | None:
         return self.of_load * (self.delay - self.moved) if self.of_load else None

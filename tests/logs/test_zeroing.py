@@ -68,11 +68,11 @@ def test_offset_that_a_motor_torque_explains_is_not_removed():
 def test_logs_of_one_drive_share_a_zero_where_it_explains_their_offset():
     first, second = (with_offset(drive_log(seed), 0.7) for seed in (0, 1))
     zero = zeroed(first, DRIVE).zero
-    assert zeroed(second, DRIVE, known=[zero]).zero == zero
+    assert zeroed(second, DRIVE, zeros=[zero]).zero == zero
     # Of a log for a prediction, 50 samples tell far less of the zero.
-    assert zeroed(replace(second, outputs_until=50), DRIVE, known=[zero]).zero == zero
-    assert zeroed(drive_log(1), DRIVE, known=[zero]).zero == 0.0
-    moved = zeroed(with_offset(drive_log(1), -0.2), DRIVE, known=[zero])
+    assert zeroed(replace(second, outputs_until=50), DRIVE, zeros=[zero]).zero == zero
+    assert zeroed(drive_log(1), DRIVE, zeros=[zero]).zero == 0.0
+    moved = zeroed(with_offset(drive_log(1), -0.2), DRIVE, zeros=[zero])
     assert moved.zero == pytest.approx(-0.2, abs=1e-7)
 
 
