@@ -1,7 +1,7 @@
 """Inter-sample behaviour of sampled signals: one polynomial per interval for every hold."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -70,25 +70,17 @@ class PiecewisePolynomial(eqx.Module):
         before = library.vectorize(search, signature="(m),(n)->(n)")(self.knots, start.real)
         source = library.clip(before - 1, 0, last)
 
-        def moments(piece, begin, end):
-            """Moments of one source piece over [begin, end] of the target interval, in Legendre polynomials."""
-            coefficients = library.take_along_axis(self.coefficients, piece[..., None], axis=-2)
-            shift = start - library.take_along_axis(self.knots, piece, axis=-1)
-            half = 0.5 * (end - begin)[..., None]
-            at = begin[..., None] + half * (_NODES[None, :] + 1.0)
-            value = polynomial(coefficients[..., None, :], at + shift[..., None])
-            shape = _legendre(2.0 * at / width[..., None] - 1.0)
-            return half * library.einsum("...nd,...n->...d", shape, value * library.asarray(_WEIGHTS)[None, :])
-
-        total, begin = 0.0, library.zeros_like(width)
+        parts, begin = [], library.zeros_like(width)
         for j in range(_PIECES):
             piece = library.minimum(source + j, last)
             following = library.take_along_axis(self.knots, piece + 1, axis=-1)
             end = library.clip(following - start, begin, width) if j < _PIECES - 1 else width
-            total = total + moments(piece, begin, end)
+            coefficients = library.take_along_axis(self.coefficients, piece[..., None], axis=-2)
+            shift = start - library.take_along_axis(self.knots, piece, axis=-1)
+            parts.append((coefficients, shift, begin, end))
             begin = end
-        legendre = total * library.asarray(_NORMS)[None, :] / width[..., None]
-        return PiecewisePolynomial(self.knots, _powers(legendre, width))
+        project = _projected if library is jnp else _projected_alike
+        return PiecewisePolynomial(self.knots, project(parts, width))
 
     def lagged(self, lag: _Number) -> "PiecewisePolynomial":
         """The signal y of `lag y' + y = self`, in steady state at the first knot, on the same knots.
@@ -104,16 +96,32 @@ class PiecewisePolynomial(eqx.Module):
         # The polynomial part: self - lag self' + lag^2 self'' - ...
         part = derivative = self.coefficients
         for _ in range(DEGREE):
-            orders = np.arange(1.0, derivative.shape[-1])
-            risen = derivative[..., 1:] * orders[None, :]
-            derivative = -lag * library.concatenate([risen, library.zeros_like(risen[..., :1])], axis=-1)
+            derivative = -lag * _rate(derivative)
             part = part + derivative
         first, end = part[..., 0], polynomial(part, width)
         # The exponential part at the start of each interval.
         away = _summed(library.exp(-width / lag)[..., :-1], end[..., :-1] - first[..., 1:])
         away = library.concatenate([library.zeros_like(first[..., :1]), away], axis=-1)
-        legendre = away[..., None] * _decay_moments(width / lag) * library.asarray(_NORMS)[None, :]
+        # Equidistant stamps share one row of moments.
+        one = width[(slice(1),) * width.ndim]
+        shared = library is np and bool(np.all(np.abs(width - one) <= _ALIKE * one))
+        legendre = away[..., None] * _decay_moments((one if shared else width) / lag) * library.asarray(_NORMS)[None, :]
         return PiecewisePolynomial(self.knots, part + _powers(legendre, width))
+
+    def unlagged(self, lag: _Number) -> "PiecewisePolynomial":
+        """The signal `self + lag self'`, which [`lagged`][] would turn into this one; a jump adds no impulse.
+
+        Args:
+            lag: time constant [s].
+        """
+        return PiecewisePolynomial(self.knots, self.coefficients + lag * _rate(self.coefficients))
+
+
+def _rate(coefficients: Any) -> Any:
+    """Coefficients of the derivative of polynomials."""
+    library = _library_of(coefficients)
+    risen = coefficients[..., 1:] * np.arange(1.0, coefficients.shape[-1])[None, :]
+    return library.concatenate([risen, library.zeros_like(coefficients[..., :1])], axis=-1)
 
 
 def _library_of(*arrays: Any) -> Any:
@@ -132,6 +140,49 @@ def _summed(factor: Any, push: Any) -> Any:
     while step < push.shape[-1]:
         push, factor, step = push + factor * earlier(push), factor * earlier(factor), 2 * step
     return push
+
+
+def _projected(parts: Sequence[tuple[Any, Any, Any, Any]], width: Any) -> Any:
+    """Coefficients of the quintics over intervals that have the moments of several pieces together.
+
+    Args:
+        parts: of each piece the coefficients; the time into it at which the interval begins; where in the interval it
+            begins and ends.
+        width: of the intervals.
+    """
+    library = _library_of(width)
+    moments = sum(_moments(*part, width) for part in parts)
+    return _powers(moments @ library.asarray(_POWERS_TO_LEGENDRE) / width[..., None], width)
+
+
+def _moments(coefficients: Any, shift: Any, begin: Any, end: Any, width: Any) -> Any:
+    """Integrals of one piece over its part of the intervals, times powers of `z`, which rises from -1 to 1 over an
+    interval."""
+    half = 0.5 * (end - begin)
+    at = [begin + half * (node + 1.0) for node in _NODES]
+    weighted = [w * half * polynomial(coefficients, t + shift) for w, t in zip(_WEIGHTS, at, strict=True)]
+    z = [2.0 * t / width - 1.0 for t in at]
+    found = [sum(weighted)]
+    for _ in range(DEGREE):
+        weighted = [value * x for value, x in zip(weighted, z, strict=True)]
+        found.append(sum(weighted))
+    return _library_of(*found).stack(found, axis=-1)
+
+
+def _projected_alike(parts: Sequence[tuple[Any, Any, Any, Any]], width: np.ndarray) -> np.ndarray:
+    """[`_projected`][] by numpy. The intervals that are cut like the middle one share one linear map: nearly all, where
+    stamps are equidistant."""
+    middle = tuple(n // 2 for n in width.shape)
+    cuts = [width, *(cut.real for _, *own in parts for cut in own)]
+    apart = np.any([np.abs(cut - cut[middle]) > _ALIKE * width[middle] for cut in cuts], axis=0)
+    units = np.eye(DEGREE + 1)
+    found: Any = 0.0
+    for coefficients, *own in parts:
+        unit = units, *(np.ravel(cut[middle]) for cut in own)
+        found = found + coefficients @ _projected([unit], np.ravel(width[middle]))
+    others = [tuple(each[apart] for each in part) for part in parts]
+    found[apart] = _projected(others, width[apart])
+    return found
 
 
 def _powers(legendre: Any, width: Any) -> Any:
@@ -172,6 +223,15 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 _FINE_NODES, _FINE_WEIGHTS = np.polynomial.legendre.leggauss(16)
 _FAST = 12.0
 _NORMS = 2.0 * np.arange(DEGREE + 1) + 1.0
+# Integrals times powers of z on [-1, 1], to coefficients of Legendre polynomials.
+_POWERS_TO_LEGENDRE = (
+    np.array(
+        [np.pad(np.polynomial.legendre.leg2poly(row), (0, DEGREE - d)) for d, row in enumerate(np.eye(DEGREE + 1))]
+    ).T
+    * _NORMS
+)
+# Cuts that differ by this share of an interval are alike: the rounding of stamps.
+_ALIKE = 1e-10
 # A delayed interval may overlap two pieces, or three with jittering stamps (by up to a third).
 _PIECES = 3
 # Rows: Legendre polynomials on [0, 1] in powers of the fraction of the interval.

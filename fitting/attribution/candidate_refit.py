@@ -12,7 +12,7 @@ from fitting.estimation.estimate import Fit, Strategy
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.one_side import contradicts, without_mesh_priors
 from hdjax import Hold, Model
-from hdjax.effects import Effect, Scales
+from hdjax.effects import Effect, InputDelay, Scales
 from hdjax.parameters import ParameterInfo, own_parameters
 
 # Iterations after which another hold of the torque must explain more: it changes the motion so little that few suffice.
@@ -123,10 +123,19 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
         hold: what the torque does between samples.
         study: the data, and how they are cut.
     """
-    near = trained(before.model, study, hold, before.training, _HOLD_STEPS)
+    near = trained(_as_late(before, hold, study), study, hold, before.training, _HOLD_STEPS)
     if near.objective > before.training.objective + RULES.least_gain:
         return None
     return challenge([near.model], study, hold, champion=before)
+
+
+def _as_late(before: Trial, hold: Hold, study: Study) -> Model:
+    """The current model with its delay changed so that the torque is as late as before on average: a zero-order hold is
+    half a sample later than any other."""
+    half = 0.5 * study.scales(before.training.stretches, before.model).time_step
+    later = half * (int(before.hold == "zero-order") - int(hold == "zero-order"))
+    delays = [e for e in before.model.effects if isinstance(e, InputDelay)]
+    return before.model.replace({f"{e.name}.delay": float(e.delay) + later for e in delays})
 
 
 def _with_form(model: Model, effect: Effect) -> Model:

@@ -1,6 +1,6 @@
 """Physical effects of harmonic drives, each inside the equations of motion."""
 
-from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
+from hdjax.effects.actuation import InputDelay, InputLag, LoggedTorqueLag, TorqueBias, TorqueGain
 from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.catalogue import BY_NAME, CATALOGUE, FAMILIES, applicable
 from hdjax.effects.cogging import Cogging, SingleOrderCogging
@@ -94,6 +94,7 @@ __all__ = [
     "LoadFriction",
     "LoadInertiaError",
     "LoadSideEffect",
+    "LoggedTorqueLag",
     "LuGreLoadFriction",
     "LuGreMotorFriction",
     "MaxwellSlip",

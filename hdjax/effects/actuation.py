@@ -1,4 +1,4 @@
-"""Effects between the logged and the acting torque: sensor gain and bias, delay, lag."""
+"""Effects between the logged and the acting torque: sensor gain and bias, delays, lags."""
 
 from typing import ClassVar
 
@@ -61,7 +61,7 @@ class TorqueGain(ActuatorEffect):
 
 
 class InputDelay(ActuatorEffect):
-    """The torque acts later than logged: `T(t) = T_logged(t - delay)`."""
+    """The torque acts later than logged: `T(t) = T_logged(t - delay)`; earlier where the log of the torque is late."""
 
     family: ClassVar[str] = "input_delay"
     name: ClassVar[str] = "input_delay"
@@ -72,7 +72,7 @@ class InputDelay(ActuatorEffect):
         unit="s",
         doc="from the logged torque to the torque that acts",
         source="EFFECTS: 0.1 to 3 ms",
-        bounds=(0.0, 0.1),
+        bounds=(-0.1, 0.1),
         plausible=(1e-4, 3e-3),
         role="strength",
     )
@@ -110,3 +110,32 @@ class InputLag(ActuatorEffect):
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.lagged(self.lag)
+
+
+class LoggedTorqueLag(ActuatorEffect):
+    """The logged torque follows the one that acts with a first-order lag, as behind a filter:
+    `T = T_logged + lag T_logged'`.
+
+    Between the steps of a zero-order hold the logged torque has no rate; there it has no influence.
+    """
+
+    family: ClassVar[str] = "input_delay"
+    name: ClassVar[str] = "logged_torque_lag"
+    takes_numpy: ClassVar[bool] = True
+
+    lag: Scalar = parameter(
+        0.0,
+        unit="s",
+        doc="time constant",
+        source="assumed: filters of a measured current, 50 Hz to 1.5 kHz",
+        bounds=(0.0, 0.1),
+        plausible=(1e-4, 3e-3),
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        return logged.unlagged(self.lag)

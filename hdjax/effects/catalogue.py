@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
+from hdjax.effects.actuation import InputDelay, InputLag, LoggedTorqueLag, TorqueBias, TorqueGain
 from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.cogging import Cogging, SingleOrderCogging
 from hdjax.effects.creep import Creep
@@ -72,6 +72,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     LoadInertiaError,
     InputDelay,
     InputLag,
+    LoggedTorqueLag,
     MotorEncoderDelay,
     LoadEncoderDelay,
     JointTorqueDelay,

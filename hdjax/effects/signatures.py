@@ -12,7 +12,7 @@ SIGNATURES: dict[str, str] = {
     "grows with the speed squared, and the natural frequency amplifies it.",
     "torque_sensor": "The residual follows the torque itself, or is constant.",
     "inertia_error": "The residual torque on one side is proportional to that side's acceleration.",
-    "input_delay": "The phase of the response lags in proportion to the frequency.",
+    "input_delay": "The phase of the response lags or leads in proportion to the frequency.",
     "gravity_load": "A torque on the load that depends on the load's angle alone, once a revolution of the output.",
     "load_disturbance": "A constant, or lines at frequencies that do not move with any shaft.",
     "backlash": "The torque-twist curve is flat around zero torque. Sub-harmonics and super-harmonics appear.",

@@ -285,3 +285,28 @@ def test_derivative_by_the_delay_agrees_with_differences(hold, intervals):
     powers = STEP ** np.arange(found.shape[1]) * STEP
     np.testing.assert_allclose(found * powers, differences * powers, rtol=1e-6, atol=2e-4)
     assert np.abs(found * powers).max() > 0.1
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("jitter", (0.0, 0.1))
+@pytest.mark.parametrize(
+    ("change", "intervals"), (("delayed", 0.6), ("delayed", -2.31), ("lagged", 1.7), ("lagged", 0.05))
+)
+def test_numpy_and_jax_change_a_signal_alike(hold, jitter, change, intervals):
+    """Also by complex steps, as the fit differentiates where nothing is traced."""
+    signal = sampled(*record(5, jitter), hold=hold)
+    by, tiny = intervals * STEP, 1e-30
+    one = jax.jvp(lambda d: getattr(signal, change)(d).coefficients, (jnp.asarray(by),), (jnp.asarray(1.0),))
+    other = getattr(jax.tree.map(np.asarray, signal), change)(by + 1j * tiny).coefficients
+    # Coefficient j counts in STEP^-j.
+    powers = STEP ** np.arange(other.shape[1])
+    np.testing.assert_allclose(other.real * powers, np.asarray(one[0]) * powers, atol=1e-9)
+    np.testing.assert_allclose(other.imag / tiny * powers * STEP, np.asarray(one[1]) * powers * STEP, atol=1e-8)
+
+
+@pytest.mark.parametrize("hold", ("linear", "cubic", "band-limited"))
+def test_signal_without_its_lag_lags_to_the_signal(hold):
+    signal, by = sampled(*record(6), hold=hold), jnp.asarray(0.7 * STEP)
+    again = signal.unlagged(by).lagged(by)
+    when = between(record(6)[0], 0.5)[10:]
+    np.testing.assert_allclose(at(again, when), at(signal, when), atol=1e-6)
