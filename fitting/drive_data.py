@@ -180,7 +180,7 @@ def base_model(drive_file: DriveFile, log: Log) -> Model:
 def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment, ...]:
     """The stretches of the log between its gaps, on their sample grids, under one hold."""
     ratio = drive_file.reduction_ratio if log.kind == "drive" else None
-    return experiments_from_log(log, hold=hold, N=ratio)
+    return experiments_from_log(log, hold=hold, N=ratio, stated=drive_file.torque_hold)
 
 
 def _with_own_names(logs: Sequence[Log]) -> tuple[Log, ...]:

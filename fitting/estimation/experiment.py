@@ -119,23 +119,26 @@ class Stretch(eqx.Module):
         return replace(self, stop=self.start + int(last) + 1)
 
 
-def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tuple[Experiment, ...]:
+def experiments_from_log(
+    log: Log, *, hold: Hold, N: float | None = None, stated: Hold | None = None
+) -> tuple[Experiment, ...]:
     """The stretches of a log between its gaps, each as an experiment; arguments as in [`experiment_from_log`][]."""
     if log.pieces is None:
-        return (experiment_from_log(log, hold=hold, N=N),)
+        return (experiment_from_log(log, hold=hold, N=N, stated=stated),)
     several = len(log.pieces) > 1
     parts = (
         experiment_from_log(
             replace(log.rows(start, stop), pieces=None, name=f"{log.name}, part {i + 1}" if several else log.name),
             hold=hold,
             N=N,
+            stated=stated,
         )
         for i, (start, stop) in enumerate(log.pieces)
     )
     return tuple(replace(part, origin=float(log.time[0]), log=log.name) for part in parts)
 
 
-def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Experiment:
+def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None, stated: Hold | None = None) -> Experiment:
     """Turn a log without wide gaps into an experiment.
 
     Where samples are missing, the torque is interpolated and samples are inserted at the usual interval, with weight
@@ -145,6 +148,8 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         log: the log.
         hold: inter-sample behaviour of the torque.
         N: reduction ratio of a drive log.
+        stated: inter-sample behaviour of torques that the user states; that of a load torque does not change with
+            `hold` then.
 
     Raises:
         DataError: the log is mostly a gap.
@@ -162,7 +167,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
     time, rows = _grid(log, stamps)
     torque = _on_grid(sampled(stamps, samples, hold=hold), time)
     # Commands of a digital drive are held between samples; measured torques are continuous and interpolated linearly.
-    load_hold = hold if hold == "zero-order" else "linear"
+    load_hold = "zero-order" if (stated or hold) == "zero-order" else "linear"
     load_torque = _channel(log, log.load_torque, time, load_hold) if drive_log else None
     outputs = fitted_outputs(log)
     columns = [_column(log, name, N) for name in outputs]
