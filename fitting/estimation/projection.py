@@ -32,6 +32,7 @@ class FirstStates(Record):
     by_first: Float[np.ndarray, "segments rows states"]
 
     @classmethod
+    @np.errstate(over="ignore", invalid="ignore")
     def of(cls, found: Blocks, joined: Bool[Array | np.ndarray, " segments"]) -> "FirstStates":
         """From a residual's derivatives."""
         joined, by_state, before = np.asarray(joined), np.asarray(found.by_state), np.asarray(found.before_by_state)
@@ -129,6 +130,8 @@ class Answers(Record):
         return self.states.without(columns, -before)[:, :rows].reshape(outputs.shape)
 
 
+# A simulation that diverges overflows; its step is rejected.
+@np.errstate(over="ignore", invalid="ignore")
 def through_segments(joined: np.ndarray, before_by_state: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Accumulate changes of each segment's initial state along joined segments."""
     found = np.empty_like(own)
