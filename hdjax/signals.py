@@ -142,7 +142,7 @@ def _summed(factor: Any, push: Any) -> Any:
     return push
 
 
-def _projected(parts: Sequence[tuple[Any, Any, Any, Any]], width: Any) -> Any:
+def _projected(parts: Sequence[tuple[Any, ...]], width: Any) -> Any:
     """Coefficients of the quintics over intervals that have the moments of several pieces together.
 
     Args:
@@ -151,13 +151,14 @@ def _projected(parts: Sequence[tuple[Any, Any, Any, Any]], width: Any) -> Any:
         width: of the intervals.
     """
     library = _library_of(width)
-    moments = sum(_moments(*part, width) for part in parts)
+    moments = sum(_moments(part, width) for part in parts)
     return _powers(moments @ library.asarray(_POWERS_TO_LEGENDRE) / width[..., None], width)
 
 
-def _moments(coefficients: Any, shift: Any, begin: Any, end: Any, width: Any) -> Any:
+def _moments(part: tuple[Any, ...], width: Any) -> Any:
     """Integrals of one piece over its part of the intervals, times powers of `z`, which rises from -1 to 1 over an
     interval."""
+    coefficients, shift, begin, end = part
     half = 0.5 * (end - begin)
     at = [begin + half * (node + 1.0) for node in _NODES]
     weighted = [w * half * polynomial(coefficients, t + shift) for w, t in zip(_WEIGHTS, at, strict=True)]
@@ -169,7 +170,7 @@ def _moments(coefficients: Any, shift: Any, begin: Any, end: Any, width: Any) ->
     return _library_of(*found).stack(found, axis=-1)
 
 
-def _projected_alike(parts: Sequence[tuple[Any, Any, Any, Any]], width: np.ndarray) -> np.ndarray:
+def _projected_alike(parts: Sequence[tuple[Any, ...]], width: np.ndarray) -> np.ndarray:
     """[`_projected`][] by numpy. The intervals that are cut like the middle one share one linear map: nearly all, where
     stamps are equidistant."""
     middle = tuple(n // 2 for n in width.shape)
