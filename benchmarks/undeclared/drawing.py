@@ -10,7 +10,7 @@ from undeclared.detection import detectability
 from undeclared.equations import integrate
 from undeclared.excitation import STANDING, TURNING, Excitation, excitation
 from undeclared.hidden import FAMILIES, Form, forms_of
-from undeclared.mechanism import Mechanism, read_encoders
+from undeclared.mechanism import Mechanism, log_torque, read_encoders
 from undeclared.noise import Encoders, draw_encoders
 
 LEAST = 2.0
@@ -77,7 +77,7 @@ class Run:
         excitation: what was commanded.
         states: true ones, (samples, states).
         readings: of noiseless encoders, (samples, 2).
-        torque: commanded motor torque, as logged.
+        torque: motor torque, as logged.
         warm: kelvin above the reference.
     """
 
@@ -262,7 +262,8 @@ class _Bench:
             brake=commanded.brake,
             warm=warm[index],
         )
-        return Run(mechanism, commanded, states, np.column_stack(read_encoders(mechanism, states)), torque, warm[index])
+        readings = np.column_stack(read_encoders(mechanism, states))
+        return Run(mechanism, commanded, states, readings, log_torque(mechanism, torque, self.dt), warm[index])
 
     def detectability(self, changes: dict, warm: Sequence[np.ndarray]) -> float:
         """Of changes alone, in the two logs that the loop is given."""

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 KNOTS = 720
 """Knots of a table over one motor revolution."""
@@ -142,6 +143,10 @@ class Mechanism(NamedTuple):
     load_disc: float = 0.0
     load_disc_order: float = 1.0
     load_disc_phase: float = 0.0
+    load_zero: float = 0.0
+    # The log of the commanded torque: samples by which it is late, and the lag of its filter [s].
+    log_late: int = 0
+    log_lag: float = 0.0
 
     @property
     def compliance(self) -> float:
@@ -176,4 +181,13 @@ def read_encoders(mechanism: Mechanism, states: np.ndarray) -> tuple[np.ndarray,
     """What noiseless encoders read [rad], motor and load."""
     m, phi, lam = mechanism, states[:, 0], states[:, 2]
     motor = phi + m.motor_disc * np.sin(m.motor_disc_order * phi + m.motor_disc_phase)
-    return motor, lam + m.load_disc * np.sin(m.load_disc_order * lam + m.load_disc_phase)
+    return motor, lam + m.load_disc * np.sin(m.load_disc_order * lam + m.load_disc_phase) + m.load_zero
+
+
+def log_torque(mechanism: Mechanism, commanded: np.ndarray, dt: float) -> np.ndarray:
+    """What the log says of a torque that is held over each sampling interval [s]."""
+    late = np.concatenate([np.full(mechanism.log_late, commanded[0]), commanded])[: commanded.size]
+    if mechanism.log_lag == 0.0:
+        return late
+    kept = np.exp(-dt / mechanism.log_lag)
+    return lfilter([0.0, 1 - kept], [1.0, -kept], late, zi=late[:1])[0]

@@ -15,7 +15,7 @@ from undeclared import drawing
 from undeclared.detection import LIMIT, detectability
 from undeclared.equations import integrate
 from undeclared.hidden import FAMILIES, FORMS, Form, forms_of
-from undeclared.mechanism import Mechanism, read_encoders, table
+from undeclared.mechanism import Mechanism, log_torque, read_encoders, table
 from undeclared.noise import Encoders
 from undeclared.predictability import own_error
 from undeclared.recording import record
@@ -198,16 +198,18 @@ def test_every_form_changes_the_log_except_at_zero_strength(form: Form):
     base = Mechanism()
     torque, warm = random_torque(200), np.full(200, 10.0)
 
-    def readings(strength: float) -> np.ndarray:
-        p = base._replace(**form.changes(strength, np.random.default_rng(3), base))
-        return np.column_stack(read_encoders(p, integrate(p, START, torque, dt=DT, substeps=100, warm=warm)[0]))
+    def log(p: Mechanism, warm: np.ndarray | None = None) -> np.ndarray:
+        states, commanded = integrate(p, START, torque, dt=DT, substeps=100, warm=warm)
+        return np.column_stack([*read_encoders(p, states), log_torque(p, commanded, DT)])
 
-    plain = np.column_stack(read_encoders(base, integrate(base, START, torque, dt=DT, substeps=100)[0]))
-    strong = readings(form.high)
+    def changed(strength: float) -> np.ndarray:
+        return log(base._replace(**form.changes(strength, np.random.default_rng(3), base)), warm)
+
+    plain, strong = log(base), changed(form.high)
     assert np.isfinite(strong).all()
     assert np.abs(strong - plain).max() > 1e-7
     if form.low < form.high:
-        assert readings(0.0) == pytest.approx(plain, rel=1e-13, abs=1e-13)
+        assert changed(0.0) == pytest.approx(plain, rel=1e-13, abs=1e-13)
 
 
 def test_dry_friction_sticks_slides_and_stops():
@@ -228,6 +230,17 @@ def test_dead_time_shifts_the_response():
     late, _ = integrate(BASE._replace(dead_time=3 * DT), np.zeros(4), torque, dt=DT, substeps=50)
     prompt, _ = integrate(BASE, np.zeros(4), torque, dt=DT, substeps=50)
     assert late[3:, :4] == pytest.approx(prompt[:-3, :4], rel=1e-12, abs=1e-15)
+
+
+def test_filtered_log_is_the_filter_of_a_held_torque_at_the_samples():
+    torque, lag, fine = random_torque(60), 0.7 * DT, 200
+    held = np.repeat(torque, fine)
+    state, filtered = torque[0], []
+    for value in held:
+        filtered.append(state)
+        state += (value - state) * -np.expm1(-DT / fine / lag)
+    found = log_torque(BASE._replace(log_lag=lag, log_late=2), torque, DT)
+    assert found[2:] == pytest.approx(np.array(filtered[::fine])[:-2], abs=1e-12)
 
 
 @pytest.mark.parametrize(
