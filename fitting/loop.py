@@ -77,7 +77,7 @@ def close_loop(
     fitted = study.data[base.hold][0]
     late = clock_shifts(read.data[base.hold][0], fitted)
     clock.lap("clocks")
-    found = search_effects(base, study, max_effects=search.max_effects, catalogue=catalogue)
+    found = search_effects(base, study, max_effects=search.max_effects, catalogue=catalogue, hold=hold)
     clock.lap("attribution")
     challenge = challenge_names(base, found.named, study, noise=found.noise)
     clock.lap("unknown effects")

@@ -129,6 +129,13 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
     return challenge([near.model], study, hold, champion=before)
 
 
+def under_best_hold(current: Trial, study: Study) -> Trial:
+    """The current model under the hold that predicts selection data best."""
+    trials = [try_hold(current, hold, study) for hold in study.data if hold != current.hold]
+    best = max((t for t in trials if t is not None), key=lambda t: t.gain_over(current), default=current)
+    return best if best.gain_over(current) > RULES.least_gain else current
+
+
 def _as_late(before: Trial, hold: Hold, study: Study) -> Model:
     """The current model with its delay changed so that the torque is as late as before on average: a zero-order hold is
     half a sample later than any other."""

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, attempt, continued, halo_for
+from fitting.attribution.candidate_refit import under_best_hold
 from fitting.attribution.rivals_again import compare_again
 from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round, look
@@ -82,7 +83,9 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Stud
     return chosen, finer
 
 
-def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Sequence[type[Effect]]) -> Search:
+def search_effects(
+    base: Trial, study: Study, *, max_effects: int, catalogue: Sequence[type[Effect]], hold: Hold | None = None
+) -> Search:
     """Add effects until the data support no further one.
 
     Args:
@@ -90,6 +93,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         study: the data and their segmentation.
         max_effects: effects to add at most.
         catalogue: candidate forms.
+        hold: inter-sample behaviour of the torque, where the user states it; else the one that suits the effects best.
     """
     current, rounds, noise, limited = base, [], measurement_noise(base.training), False
     while len(rounds) - len(_replaced(rounds)) < max_effects:
@@ -110,6 +114,8 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         study.progress(f"found {this.winner.name}")
     else:
         limited = True
+    if hold is None and current is not base:
+        current = under_best_hold(current, study)
     dropped = [*_holds_given_up(rounds, base.hold, current.hold), *_replaced(rounds)]
     accepted = [this.winner.name for this in rounds if this.accepted and this.winner.name not in dropped]
     current, superfluous, without = _without_superfluous(accepted, current, base, study)
@@ -117,8 +123,13 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
     current, compared, instead = compare_again(kept, current, study)
     if instead:
-        rounds, dropped, without = [*rounds, *instead.values()], [*dropped, *instead], {}
+        rounds, dropped = [*rounds, *instead.values()], [*dropped, *instead]
         kept = [instead[name] if (name := this.winner.name) in instead else this for this in kept]
+        # Beside a better law another effect may explain nothing.
+        names = [this.winner.name for this in kept]
+        current, superfluous, without = _without_superfluous(names, current, base, study)
+        dropped += superfluous
+        kept, compared = ([r for r in some if r.winner.name not in superfluous] for some in (kept, compared))
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared), limited)

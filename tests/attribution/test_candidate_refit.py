@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 
 import rig
-from fitting.attribution.candidate_fit import Trial, first_pass
-from fitting.attribution.candidate_refit import _as_sibling, _unstuck, begin
+from fitting.attribution.candidate_fit import Trial, attempt, first_pass
+from fitting.attribution.candidate_refit import _as_sibling, _unstuck, begin, under_best_hold
 from fitting.attribution.screening import Lead
 from fitting.attribution.selection_round import _are_siblings
 from fitting.attribution.study import Setting, Study
 from fitting.estimation.estimate import fit
-from fitting.estimation.experiment import whole
+from fitting.estimation.experiment import experiment_from_log, split, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
-from hdjax import Model
-from hdjax.effects.actuation import TorqueBias
+from hdjax import Hold, Model
+from hdjax.effects.actuation import InputDelay, TorqueBias
 from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.effect import Scales
 from hdjax.effects.friction import LoadFriction, MotorFriction
@@ -87,3 +87,18 @@ def test_a_refit_that_was_led_away_starts_from_the_model_that_it_contains():
     replaced = replace(before, model=rig.drive_model().with_effects(TorqueBias(bias=0.1), Backlash(b=2e-4)))
     for sibling in (None, replaced):
         assert begin(before, lead, study, sibling=sibling).objective <= found.objective
+
+
+def test_delay_goes_on_under_the_hold_that_suits_it():
+    """A smooth hold with a delay of half a sample is nearly a zero-order hold without any."""
+    torque = rig.drive_torque(3000)
+    log = rig.drive_log(rig.drive_motion(torque), torque)
+    holds: tuple[Hold, ...] = ("cubic", "zero-order")
+    data = {h: split([experiment_from_log(log, hold=h, N=rig.N)]) for h in holds}
+    study = Study(data, Setting(Segmentation(128, halo=4)))
+    half = 0.5 * float(log.time[1] - log.time[0])
+    smooth = attempt(rig.drive_model().with_effects(InputDelay(delay=half)), study, "cubic")
+    found = under_best_hold(smooth, study)
+    assert found.hold == "zero-order" and abs(float(found.model.get("input_delay.delay"))) < 0.02 * half
+    assert float(smooth.model.get("input_delay.delay")) == pytest.approx(half, rel=0.05)
+    assert under_best_hold(found, study) is found
