@@ -299,7 +299,10 @@ class TwoInertiaModel(Model):
 
     def _load_as_read(self, state: State) -> tuple[Array, Array]:
         """The load's angle and rate when its sensors are read: Taylor's series to the third order in the delay, as the
-        bare drive moves without a torque. What else moves the load counts to the first order."""
+        bare drive moves without a torque. What else moves the load counts to the first order.
+
+        A filter's lag is a delay and, by its transfer function `exp(lag s) / (1 + lag s)`, terms from the second order
+        on."""
         ahead = _ahead(effect.load_delay() for effect in self._of(SensorEffect))
         theta_l, omega_l = state[1], state[3]
         if ahead is None:
@@ -308,7 +311,12 @@ class TwoInertiaModel(Model):
         torque = self.drive.mesh_torque(motion.x, motion.v)
         slope = time_derivative(self.drive.mesh_torque)(motion.x, motion.v, -self._mesh_mobility * torque)
         moving = theta_l, omega_l, torque / self._load_inertia, slope / self._load_inertia
-        return taylor(moving, ahead), taylor(moving[1:], ahead)
+        theta_l, omega_l = taylor(moving, ahead), taylor(moving[1:], ahead)
+        for effect in self._of(SensorEffect):
+            if (lag := effect.load_lag()) is not None:
+                theta_l = theta_l + lag**2 / 2 * moving[2] - lag**3 / 3 * moving[3]
+                omega_l = omega_l + lag**2 / 2 * moving[3]
+        return theta_l, omega_l
 
     def _torque_as_read(self, state: State, inputs: Inputs | None) -> Array:
         """Reading of the joint torque's sensor."""

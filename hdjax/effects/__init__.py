@@ -50,6 +50,7 @@ from hdjax.effects.sensing import (
     JointTorqueDelay,
     LoadEncoderDelay,
     LoadEncoderEccentricity,
+    LoadEncoderLag,
     MotorEncoderDelay,
     MotorEncoderEccentricity,
 )
@@ -91,6 +92,7 @@ __all__ = [
     "LoadDisturbance",
     "LoadEncoderDelay",
     "LoadEncoderEccentricity",
+    "LoadEncoderLag",
     "LoadFriction",
     "LoadInertiaError",
     "LoadSideEffect",

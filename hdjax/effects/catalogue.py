@@ -37,6 +37,7 @@ from hdjax.effects.sensing import (
     JointTorqueDelay,
     LoadEncoderDelay,
     LoadEncoderEccentricity,
+    LoadEncoderLag,
     MotorEncoderDelay,
     MotorEncoderEccentricity,
 )
@@ -75,6 +76,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     LoggedTorqueLag,
     MotorEncoderDelay,
     LoadEncoderDelay,
+    LoadEncoderLag,
     JointTorqueDelay,
     GravityLoad,
     ConstantLoad,

@@ -287,6 +287,10 @@ class SensorEffect(Effect):
         """Time by which the load's encoder is read later than the motor's [s]; None where they are read together."""
         return None
 
+    def load_lag(self) -> Array | None:
+        """Time constant of a filter of the load's encoder [s], a part of its delay; None without one."""
+        return None
+
     def torque_delay(self) -> Array | None:
         """Time by which the sensor of the joint torque is read later than the motor's encoder [s]; None likewise."""
         return None

@@ -187,6 +187,16 @@ class LoadEncoderDelay(SensorDelay):
         return (cls(),)
 
 
+class LoadEncoderLag(LoadEncoderDelay):
+    """The load's sensors read `y` of `delay y' + y = theta_l`, as behind a filter: slow motions are read late by
+    `delay`, fast ones are weakened as well."""
+
+    name: ClassVar[str] = "load_encoder_lag"
+
+    def load_lag(self) -> Array | None:
+        return self.delay
+
+
 class JointTorqueDelay(SensorDelay):
     """The sensor of the joint torque reads `tau(t - delay)`."""
 

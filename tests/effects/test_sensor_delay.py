@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete, lfilter
 
 import joints
 import rig
@@ -23,7 +24,7 @@ from hdjax import Drive, TwoInertiaModel
 from hdjax.dynamics import Inputs
 from hdjax.effects import Conditions
 from hdjax.effects.friction import ViscousMotorFriction
-from hdjax.effects.sensing import JointTorqueDelay, LoadEncoderDelay, MotorEncoderDelay, SensorDelay
+from hdjax.effects.sensing import JointTorqueDelay, LoadEncoderDelay, LoadEncoderLag, MotorEncoderDelay, SensorDelay
 
 COUNT, FINER = 2000, 5
 TORQUE = rig.drive_torque(COUNT)
@@ -31,21 +32,27 @@ FINE = rig.drive_motion(np.repeat(TORQUE, FINER), step=rig.STEP / FINER, substep
 MODEL = TwoInertiaModel(Drive(N=rig.N, J_m=rig.J_M, J_l=rig.J_L, K=1.0))
 
 
-def log_with_late_encoder(side: int, steps: int) -> Stretch:
-    """The rig's log with one encoder read some fifths of a sample late."""
+def log_with_late_encoder(form: type[SensorDelay], side: int, steps: int) -> Stretch:
+    """The rig's log with one encoder read some fifths of a sample late, or behind a filter of that time constant."""
     rows = np.arange(COUNT) * FINER
     motion = FINE[rows].copy()
-    motion[:, side] = FINE[np.maximum(rows - steps, 0), side]
+    if form is LoadEncoderLag:
+        # Exact for an input that is linear within a step.
+        numerator, denominator, _ = cont2discrete(([1.0], [float(steps), 1.0]), 1.0, method="foh")
+        motion[:, side] = lfilter(np.ravel(numerator), denominator, FINE[:, side])[rows]
+    else:
+        motion[:, side] = FINE[np.maximum(rows - steps, 0), side]
     log = rig.drive_log(motion, TORQUE, noise=10.0)
     return Stretch(experiment_from_log(log, hold="zero-order", N=rig.N), 0, COUNT)
 
 
 @pytest.mark.parametrize(
-    "form, side, steps", [(MotorEncoderDelay, 0, 17), (LoadEncoderDelay, 1, 4), (LoadEncoderDelay, 1, 17)]
+    "form, side, steps",
+    [(MotorEncoderDelay, 0, 17), (LoadEncoderDelay, 1, 4), (LoadEncoderDelay, 1, 17), (LoadEncoderLag, 1, 6)],
 )
 def test_encoder_delay_is_estimated_from_a_log(form: type[SensorDelay], side: int, steps: int):
     """A delay within a row, and one of several rows, a tenth of a natural period."""
-    stretch = log_with_late_encoder(side, steps)
+    stretch = log_with_late_encoder(form, side, steps)
     base = base_fit(MODEL, (stretch,)).fit
     model = base.model.with_effects(form(delay=max(1e-5, form.of_load * delay_of_load(MODEL, (stretch,)))))
     paths = (*base_paths(base.model), *effect_paths(model.effects[0]))
