@@ -198,7 +198,7 @@ def _decay_moments(rate: Inexact[Array | np.ndarray, "*batch n"]) -> Inexact[Arr
     slow = library.where(rate < _FAST, rate, 1.0)
     u = library.asarray(0.5 * (_FINE_NODES + 1.0))
     weighted = library.asarray(0.5 * _FINE_WEIGHTS)[None, :] * library.exp(-slow[..., None] * u[None, :])
-    by_quadrature = weighted @ _legendre(library.asarray(_FINE_NODES))
+    by_quadrature = weighted @ library.asarray(np.polynomial.legendre.legvander(_FINE_NODES, DEGREE))
     # Modified spherical Bessel functions of half the rate, scaled; their recurrence is stable where it is large.
     half = 0.5 * library.where(rate < _FAST, _FAST, rate)
     tail = library.exp(-2.0 * half)
@@ -245,15 +245,6 @@ _LEGENDRE_TO_POWERS = np.array(
         for d in range(DEGREE + 1)
     ]
 )
-
-
-def _legendre(z: Any) -> Any:
-    """The Legendre polynomials up to DEGREE at `z`, stacked last."""
-    library = _library_of(z)
-    found = [library.ones_like(z), z]
-    for d in range(1, DEGREE):
-        found.append(((2 * d + 1) * z * found[d] - d * found[d - 1]) / (d + 1))
-    return library.stack(found, axis=-1)
 
 
 def sampled(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], *, hold: Hold) -> PiecewisePolynomial:

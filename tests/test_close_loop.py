@@ -194,6 +194,8 @@ def test_withdrawn_hold_is_not_a_finding(friction_loop, tried: list[Hold], given
         )
         now = hold
     assert _holds_given_up(rounds, first, now) == given_up
+    # Another one that suits the final model better.
+    assert _holds_given_up(rounds, first, "band-limited") == [f"{hold} hold" for hold in tried]
 
 
 def test_single_precision_is_refused():

@@ -133,8 +133,8 @@ def _terms(table: Table, omega_0: float) -> dict[str, list[Column]]:
         "input_delay": motor(np.gradient(torque, table.dt)),
         "extra_resonance": load(rate(rate(r, table.dt, span), table.dt, span)),
         "creep": mesh(_lagged(x, 0.2 / table.dt), _lagged(x, 1.0 / table.dt)),
-        # An error of a reading is a torque that grows with the square of the speed.
         "encoder_offset": mesh(one),
+        # An error of a reading is a torque that grows with the square of the speed.
         "encoder_eccentricity:motor": motor(*(w**2 * wave for wave in waves[:2])),
         "encoder_eccentricity:load": load(r**2 * np.cos(lam), r**2 * np.sin(lam), np.cos(lam) * w, np.sin(lam) * w),
     }

@@ -123,7 +123,7 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
         hold: what the torque does between samples.
         study: the data, and how they are cut.
     """
-    near = trained(_as_late(before, hold, study), study, hold, before.training, _HOLD_STEPS)
+    near = trained(_as_late(before, hold), study, hold, before.training, _HOLD_STEPS)
     if near.objective > before.training.objective + RULES.least_gain:
         return None
     return challenge([near.model], study, hold, champion=before)
@@ -136,13 +136,13 @@ def under_best_hold(current: Trial, study: Study) -> Trial:
     return best if best.gain_over(current) > RULES.least_gain else current
 
 
-def _as_late(before: Trial, hold: Hold, study: Study) -> Model:
+def _as_late(before: Trial, hold: Hold) -> Model:
     """The current model with its delay changed so that the torque is as late as before on average: a zero-order hold is
     half a sample later than any other."""
-    half = 0.5 * study.scales(before.training.stretches, before.model).time_step
-    later = half * (int(before.hold == "zero-order") - int(hold == "zero-order"))
+    later = 0.5 * ((before.hold == "zero-order") - (hold == "zero-order"))
+    step = before.training.stretches[0].experiment.time_step
     delays = [e for e in before.model.effects if isinstance(e, InputDelay)]
-    return before.model.replace({f"{e.name}.delay": float(e.delay) + later for e in delays})
+    return before.model.replace({f"{e.name}.delay": float(e.delay) + later * step for e in delays})
 
 
 def _with_form(model: Model, effect: Effect) -> Model:

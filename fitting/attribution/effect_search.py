@@ -171,11 +171,11 @@ def _replaced(rounds: Sequence[Round]) -> list[str]:
 
 
 def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[str]:
-    """Accepted holds of the torque that a later one replaces."""
-    holds = [
-        this for this in rounds if this.accepted and this.winner.trial and this.winner.trial.hold != this.before.hold
-    ]
-    return [this.winner.name for this in holds if last == first or this is not holds[-1]]
+    """Accepted holds of the torque that the final model does not have, or that the base model has."""
+    winners = [(this.winner, this.before) for this in rounds if this.accepted]
+    changes = [(w.name, w.trial.hold) for w, before in winners if w.trial and w.trial.hold != before.hold]
+    given_up = changes[:-1] if last != first and changes and changes[-1][1] == last else changes
+    return [name for name, _ in given_up]
 
 
 def refitted_without(names: Collection[str], current: Trial, base: Trial, study: Study) -> Trial:

@@ -86,11 +86,10 @@ class InputDelay(ActuatorEffect):
         return logged.delayed(self.delay)
 
 
-class InputLag(ActuatorEffect):
-    """The torque follows the logged one with a first-order lag: `lag T' + T = T_logged`, as a current loop does."""
+class _Lag(ActuatorEffect):
+    """A first-order lag between the logged and the acting torque."""
 
     family: ClassVar[str] = "input_delay"
-    name: ClassVar[str] = "input_lag"
     takes_numpy: ClassVar[bool] = True
 
     lag: Scalar = parameter(
@@ -108,34 +107,24 @@ class InputLag(ActuatorEffect):
         # At exactly zero the exponential has no derivative.
         return (cls(lag=1e-9 * scales.time_step),)
 
+
+class InputLag(_Lag):
+    """The torque follows the logged one with a first-order lag: `lag T' + T = T_logged`, as a current loop does."""
+
+    name: ClassVar[str] = "input_lag"
+
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.lagged(self.lag)
 
 
-class LoggedTorqueLag(ActuatorEffect):
+class LoggedTorqueLag(_Lag):
     """The logged torque follows the one that acts with a first-order lag, as behind a filter:
     `T = T_logged + lag T_logged'`.
 
     Between the steps of a zero-order hold the logged torque has no rate; there it has no influence.
     """
 
-    family: ClassVar[str] = "input_delay"
     name: ClassVar[str] = "logged_torque_lag"
-    takes_numpy: ClassVar[bool] = True
-
-    lag: Scalar = parameter(
-        0.0,
-        unit="s",
-        doc="time constant",
-        source="assumed: filters of a measured current, 50 Hz to 1.5 kHz",
-        bounds=(0.0, 0.1),
-        plausible=(1e-4, 3e-3),
-        role="strength",
-    )
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.unlagged(self.lag)
