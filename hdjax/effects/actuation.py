@@ -102,16 +102,16 @@ class _Lag(ActuatorEffect):
         role="strength",
     )
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        # At exactly zero the exponential has no derivative.
-        return (cls(lag=1e-9 * scales.time_step),)
-
 
 class InputLag(_Lag):
     """The torque follows the logged one with a first-order lag: `lag T' + T = T_logged`, as a current loop does."""
 
     name: ClassVar[str] = "input_lag"
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        # At exactly zero the exponential has no derivative.
+        return (cls(lag=1e-9 * scales.time_step),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.lagged(self.lag)
@@ -125,6 +125,10 @@ class LoggedTorqueLag(_Lag):
     """
 
     name: ClassVar[str] = "logged_torque_lag"
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.unlagged(self.lag)
