@@ -15,7 +15,11 @@ Logs = Annotated[list[Path], Parameter(help="Log files of one drive, of any form
 AnyLogs = Annotated[list[Path], Parameter(help="Log files of any format, or folders of them.", negative="")]
 TestLogs = Annotated[
     tuple[Path, ...],
-    Parameter(help="Logs of the same drive that are test data, in place of the last fifth of each log.", negative=""),
+    Parameter(
+        help="One or more logs of the same drive that are test data, in place of the last fifth of each log.",
+        consume_multiple=True,
+        negative="",
+    ),
 ]
 Search = Annotated[SearchOptions, Parameter(name="*")]
 DriveFileOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]

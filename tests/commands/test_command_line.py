@@ -246,6 +246,14 @@ def test_speeds_command_reports_the_resonant_band_of_the_preset(tmp_path: Path, 
     assert content["two_motions_rpm"] is None
 
 
+@pytest.mark.parametrize("options", [["--test", "b.csv", "c.csv"], ["--test", "b.csv", "--test", "c.csv"]])
+def test_no_test_log_is_fitted(options: Sequence[str]):
+    arguments = ["close-loop", "a.csv", *options, "--drive", "drive.toml", "--out", "report"]
+    _, bound, _ = command_line.app.parse_args(arguments, exit_on_error=False, print_error=False)
+    assert bound.args == ([Path("a.csv")],)
+    assert bound.kwargs["test"] == (Path("b.csv"), Path("c.csv"))
+
+
 def test_shell_completion_is_installed(tmp_path, monkeypatch):
     # The start-up file of the shell is changed as well.
     monkeypatch.setenv("HOME", str(tmp_path))
