@@ -1,9 +1,11 @@
 """Atomic writing of files, and content for JSON."""
 
+import contextlib
+import errno
 import math
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +25,34 @@ def write_whole(contents: Mapping[Path, str | bytes], *, older: Iterable[Path] =
     try:
         for path, content in contents.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-            waiting.append((name, path))
-            with os.fdopen(handle, "wb") as file:
-                file.write(content.encode() if isinstance(content, str) else content)
-            # mkstemp creates files that only the owner can read; a report is an ordinary file.
-            os.chmod(name, 0o644)
+            with _naming(path):
+                if path.is_dir():
+                    raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+                handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+                waiting.append((name, path))
+                with os.fdopen(handle, "wb") as file:
+                    file.write(content.encode() if isinstance(content, str) else content)
+                # mkstemp creates files that only the owner can read; a report is an ordinary file.
+                os.chmod(name, 0o644)
         while waiting:
             name, path = waiting[0]
-            os.replace(name, path)
+            with _naming(path):
+                os.replace(name, path)
             waiting.pop(0)
         for path in set(older) - set(contents):
             path.unlink(missing_ok=True)
     finally:
         for name, _ in waiting:
             os.unlink(name)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors of the system name the destination, not the temporary file."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def finite(value: Any, *, infinite: float | None = None) -> Any:

@@ -69,6 +69,12 @@ class Model(eqx.Module):
     motion_states: eqx.AbstractClassVar[tuple[str, ...]]
     measured: eqx.AbstractVar[tuple[str, ...]]
 
+    def __check_init__(self):
+        # Hidden states are found by their effect's name.
+        names = [effect.name for effect in self.effects if effect.states]
+        if len(set(names)) < len(names):
+            raise ValueError(f"effects with memory must have different names, but are {', '.join(names)}")
+
     @abc.abstractmethod
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         """The motion of a state, at the mesh."""

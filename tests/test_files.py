@@ -98,6 +98,14 @@ def test_failed_later_renaming_leaves_only_whole_files(tmp_path: Path, monkeypat
     assert contents(tmp_path) in ({"one.txt": "new", "two.txt": "old"}, {"two.txt": "old"})
 
 
+def test_errors_name_the_destination(tmp_path: Path):
+    (tmp_path / "two.txt").mkdir()
+    with pytest.raises(IsADirectoryError) as refusal:
+        write_whole({tmp_path / "one.txt": "new", tmp_path / "two.txt": "more"})
+    assert refusal.value.filename == str(tmp_path / "two.txt")
+    assert [p.name for p in tmp_path.iterdir()] == ["two.txt"]
+
+
 def test_folder_that_is_a_file_is_refused(tmp_path: Path):
     (tmp_path / "taken").write_text("", encoding="utf-8")
     with pytest.raises(OSError):

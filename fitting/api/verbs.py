@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 from fitting.api.data import Data
 from fitting.api.results import FitResult, LoopResult
+from fitting.errors import InputError
 from fitting.estimation.base_fit import need_double_precision
 from fitting.fit_drive import fit_only
 from fitting.progress import Progress, silent
@@ -20,12 +21,15 @@ def fit(data: Data, *, draws: int | None = None, progress: Progress = silent) ->
         progress: Receives messages.
 
     Raises:
+        InputError: Draws are requested for quasi-static logs.
         DataError: The logs can't support a fit.
         ImportError: Draws are requested and blackjax is not installed.
         ValueError: JAX computes in single precision.
     """
     need_double_precision()
     if data.kind == "quasi-static":
+        if draws is not None:
+            raise InputError(f"{data.logs[0].path}: a quasi-static log has no draws from the posterior; ask for none")
         # Imported here, like the others: each import takes long, and most logs need one of them.
         from fitting.quasi_static.results import fit_quasi_static_logs
 

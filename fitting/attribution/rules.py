@@ -84,7 +84,7 @@ class DecisionRules:
     noise_gain: float = _rule(
         5.0,
         "nats",
-        "least log likelihood ratio of an effect, less its parameters' penalty, or of torque noise, against noise without it",
+        "least log likelihood ratio, less the penalty for parameters, of an effect or of torque noise against none",
         "the best of fifty forms gains 4 by chance",
     )
     innovations: float = _rule(

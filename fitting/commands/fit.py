@@ -10,6 +10,7 @@ from fitting.commands.options import (
     Search,
     TestLogs,
     require_folder,
+    require_seed,
     wanted,
 )
 from fitting.commands.start import start_jax
@@ -51,6 +52,7 @@ def fit(
         and write it to next_experiment.csv.
     """
     require_folder(out)
+    require_seed(seed)
     asked = wanted(limits, next_experiment)
     folder = next((path for path in logs if path.is_dir()), None)
     if (fleet.workers or fleet.scheduler) and folder is None:
@@ -100,6 +102,7 @@ def close_loop(
         it to next_experiment.csv.
     """
     require_folder(out)
+    require_seed(search.seed)
     if search.max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {search.max_effects}")
     asked = wanted(limits, next_experiment)
@@ -120,6 +123,7 @@ def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
         Of torque and noise.
     """
     require_folder(out)
+    require_seed(seed)
     start_jax()
     from fitting.commands.run_fit import demonstrate
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fitting.commands.options import AnyLogs
+from fitting.commands.options import AnyLogs, require_file
 from fitting.errors import InputError
 
 
@@ -33,8 +33,7 @@ def init(logs: AnyLogs, /, *, out: Path, joint: str | None = None, force: bool =
     force
         Overwrite an existing file.
     """
-    if out.is_dir():
-        raise InputError(f"--out must be a file, but {out} is a folder; give the drive file's own name")
+    require_file(out)
     if out.exists() and not force:
         raise InputError(f"--out: {out} exists already; give another name, or --force to overwrite it")
     from fitting.commands.run_inspect import write_drive_file

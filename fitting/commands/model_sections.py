@@ -31,6 +31,10 @@ def with_stated_effects(file: Sections, model: Model) -> Model:
         fields = {f.name: f for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata}
         numbers = file.numbers(where, table, fields)
         file.needs(where, table, [n for n, f in fields.items() if f.default is dataclasses.MISSING])
+        for key, value in numbers.items():
+            low, high = fields[key].metadata["parameter"].bounds
+            if not low <= value <= high:
+                raise file.refuse(f"[{where}] {key} must lie within {low:g} to {high:g}, but is {value:g}")
         model = model.with_effects(BY_NAME[name](**numbers))
     return model
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fitting.commands.options import DriveFileOption, ForcingOptions, require_number
+from fitting.commands.options import DriveFileOption, ForcingOptions, require_file, require_number, require_seed
 from fitting.commands.start import start_jax
 
 
@@ -21,6 +21,7 @@ def predict(model: Path, log: Path, /, *, drive: DriveFileOption, out: Path) -> 
         CSV file with the columns time and each fitted output of the model, the principal one first (dynamic_error
         where available).
     """
+    require_file(out)
     start_jax()
     from fitting.commands.run_predict import write_prediction
 
@@ -51,6 +52,8 @@ def simulate(
     seed
         Of phases and noise.
     """
+    require_file(out)
+    require_seed(seed)
     for name in ("duration", "rate", "frequency", "frequency_end"):
         require_number(f"--{name.replace('_', '-')}", getattr(torque, name))
     require_number("--amplitude", torque.amplitude, positive=False)

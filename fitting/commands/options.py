@@ -123,6 +123,26 @@ def require_number(name: str, value: float, *, positive: bool = True) -> None:
         raise InputError(f"{name} must be a {'positive ' if positive else ''}number, but is {value:g}")
 
 
+def require_seed(seed: int) -> None:
+    """Refuse a number that can't seed random numbers.
+
+    Raises:
+        InputError: names the option.
+    """
+    if not 0 <= seed < 1 << 31:
+        raise InputError(f"--seed must be a whole number from 0 to {(1 << 31) - 1}, but is {seed}")
+
+
+def require_file(path: Path) -> None:
+    """Refuse an output file whose name is that of a folder, before the computation.
+
+    Raises:
+        InputError: names the option.
+    """
+    if path.is_dir():
+        raise InputError(f"--out must be a file, but {path} is a folder; give the file's own name")
+
+
 def require_folder(path: Path | None) -> None:
     """Refuse a folder that can't be written to, before the computation. Nothing is created.
 

@@ -42,6 +42,7 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
         spreads = {
             p: (float(e["value"]), float(e["std"] or np.inf), bool(e["identifiable"])) for p, e in estimates.items()
         }
+        correlation = _correlation(account, tuple(spreads))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder}: no report.json of `hdjax fit` ({error}); give the folder of a report") from error
     if not spreads:
@@ -64,7 +65,7 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
         rows = np.linspace(0, table.height - 1, min(count, table.height)).round().astype(int)
         return Draws(paths, jnp.asarray(table.to_numpy()[rows]))
     positive = np.array([model.parameters()[p][1].positive for p in paths])
-    return Draws(paths, jnp.asarray(_normal(spreads, _correlation(account, paths), positive, count, seed)))
+    return Draws(paths, jnp.asarray(_normal(spreads, correlation, positive, count, seed)))
 
 
 def fitted_model(folder: Path) -> TwoInertiaModel:

@@ -10,7 +10,7 @@ from fitting.estimation.free_run import WINDOW
 
 
 def write_prediction(model: Path, log: Path, drive: Path, out: Path) -> None:
-    """Run a model freely along a log and write its dynamic error.
+    """Run a model freely along a log and write the outputs that it predicts.
 
     Args:
         model: model.json of a report.

@@ -24,6 +24,7 @@ from hdjax.response.critical_speeds import SpeedBand, can_persist, critical_spee
 from hdjax.response.plots import speed_plot
 
 _RPM = 30.0 / math.pi
+_SMALLEST_LINE = 0.01  # of a learned error, of the largest one: below it the resonance is a hundredth of the other
 _BEYOND = 10.0  # times the natural frequency: the last resonance, a sub-harmonic, is at three times it
 
 
@@ -60,21 +61,22 @@ def show_speeds(
             f"but is {fastest:g}"
         )
     own = tuple(e for e in effects if isinstance(e, MeshGeometryEffect)) or (KinematicError(cos_2=kinematic_error),)
-    over = [e.name for e in own if "theta_l" in e.angles]
+    over = [e.name for e in own if "theta_l" in e.angles or (isinstance(e, KinematicHarmonic) and not e.repeats())]
     if over:
         raise InputError(
             f"{drive.model}: {over[0]} does not repeat with the motor's revolution; give a model without it"
         )
-    around = jnp.linspace(0.0, 2 * jnp.pi, 256)
-    size = float(jnp.max(jnp.abs(sum(error.error(around) for error in own))))
-    limit = 3.0 * size if limit is None else limit
-    if not limit > 0.0:
+    around = jnp.linspace(0.0, 2 * jnp.pi, 4096, endpoint=False)
+    whole = np.asarray(sum(error.error(around) for error in own))
+    size = float(np.max(np.abs(whole)))
+    if not size > 0.0:
         raise InputError(f"{drive.model}: its kinematic error is zero; give a model with one, or none and a preset")
-    orders = sorted({n for error in own for n in _orders(error)})
+    limit = 3.0 * size if limit is None else limit
+    orders = _orders(whole)
     model = TwoInertiaModel(made, own)
     with spinning("following the response over the speed"):
         branches = from_both_ends(
-            model, None, slowest / _RPM, fastest / _RPM, rotating=True, harmonics=max(12, *(2 * n for n in orders))
+            model, None, slowest / _RPM, fastest / _RPM, rotating=True, harmonics=max(12, 2 * orders[-1])
         )
     if not any(bool(b.complete) for b in branches):
         raise DataError(
@@ -108,11 +110,10 @@ def show_speeds(
     show_files(files)
 
 
-def _orders(error: MeshGeometryEffect) -> list[int]:
-    """Cycles of a kinematic error in a revolution of the motor."""
-    if isinstance(error, KinematicHarmonic):
-        return [round(float(error.n))]
-    return [n for n in KinematicError.orders if jnp.hypot(getattr(error, f"cos_{n}"), getattr(error, f"sin_{n}"))]
+def _orders(error: np.ndarray) -> list[int]:
+    """Cycles of a kinematic error in a revolution of the motor: of every line above a share of the largest."""
+    lines = np.abs(np.fft.rfft(error))[1:]
+    return [int(n) for n in np.flatnonzero(lines > _SMALLEST_LINE * lines.max()) + 1]
 
 
 def _coexisting(branches: Sequence[Branch]) -> tuple[float, float] | None:

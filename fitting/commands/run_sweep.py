@@ -65,12 +65,14 @@ def _write_result(result, path: Path) -> None:
 def _text(result) -> str:
     """Text of a sweep for a terminal."""
     a = result.attrs
+    errors = f"{a['checked_error']:.1e} at most, {a['checked_median_error']:.1e} in the median"
+    checked = np.isfinite(a["checked_error"])
     lines = [
         f"{a['points']} points: {a['route']}",
         f"Error on {a['checked_points']} drawn points against {a['checked_against']}: "
-        f"{a['checked_error']:.1e} at most, {a['checked_median_error']:.1e} in the median",
+        f"{errors if checked else 'no point could be checked'}",
     ]
-    if not a["tolerance_kept"]:
+    if checked and not a["tolerance_kept"]:
         lines.append(f"The tolerance of {a['tolerance']:g} is exceeded on these points: some motions amplify errors")
     if "motions" in result:
         several, lost = int((result.motions > 1).sum()), int(result.lost.sum())

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from fitting.inspection.inspection import Inspection, SignalGuess
+from fitting.inspection.inspection import Inspection, SignalGuess, confidence_percent
 from fitting.inspection.unit_evidence import is_counts
 from fitting.logs.channels import SI
 
@@ -34,7 +34,7 @@ def drive_tables(inspection: Inspection) -> dict[str, Any]:
     """The known tables of a drive file, without values that must be filled in."""
     joint = inspection.joint
     drive: dict[str, Any] = {"name": _name(inspection)}
-    if joint.ratio is not None and joint.ratio.sure and _known_angles(inspection):
+    if joint.ratio is not None and joint.ratio.sure:
         drive["reduction_ratio"] = _number(joint.ratio.value)
     columns = {s: _place(inspection, joint.signals[s]) for s in _written(inspection)}
     if inspection.time.column is not None:
@@ -157,7 +157,7 @@ def _why_not_written(guess: SignalGuess) -> str:
 
 
 def _with_reason(line: str, guess: SignalGuess) -> str:
-    return f"{line}  # guess, {_percent(guess.confidence)}: {_plain(guess.why)}"
+    return f"{line}  # guess, {confidence_percent(guess.confidence)}: {_plain(guess.why)}"
 
 
 def _ratio_lines(inspection: Inspection) -> list[str]:
@@ -209,7 +209,7 @@ def _time_lines(inspection: Inspection) -> list[str]:
     if time.column is None:
         return [f"# time: {_plain('; '.join(time.reasons))}"]
     place = _time_place(inspection)
-    return [f"time = {_toml(place)}  # guess, {_percent(time.confidence)}: {_plain('; '.join(time.reasons))}"]
+    return [f"time = {_toml(place)}  # guess, {confidence_percent(time.confidence)}: {_plain('; '.join(time.reasons))}"]
 
 
 def _open_lines(inspection: Inspection) -> list[str]:
@@ -223,11 +223,7 @@ def _open_lines(inspection: Inspection) -> list[str]:
 
 
 def _listed(shares: dict[str, float]) -> str:
-    return ", ".join(f"{signal} ({_percent(share)})" for signal, share in shares.items())
-
-
-def _percent(share: float) -> str:
-    return f"{100 * min(share, 0.99):.0f} %"
+    return ", ".join(f"{signal} ({confidence_percent(share)})" for signal, share in shares.items())
 
 
 def _number(value: float) -> int | float:

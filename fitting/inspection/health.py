@@ -11,7 +11,7 @@ from fitting.inspection.drive_text import drive_tables
 from fitting.inspection.inspection import Inspection
 from fitting.inspection.time_column import sampling_findings
 from fitting.logs.checks import examine
-from fitting.logs.drive_file import SIGNALS, drive_of
+from fitting.logs.drive_file import drive_of
 from fitting.logs.findings import Finding
 from fitting.logs.log import read_log
 from fitting.logs.masks import masked
@@ -27,7 +27,7 @@ def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
     """The findings for each log."""
     tables = drive_tables(inspection)
     current = inspection.joint.signals.get("motor_current")
-    if current is not None and "motor_torque" not in inspection.joint.signals and "motor_current" in SIGNALS:
+    if current is not None and "motor_torque" not in inspection.joint.signals:
         place = {"column": inspection.unique(current.column), "unit": current.unit or "A"}
         tables["columns"]["motor_current"] = place | {"torque_constant": _ANY_CONSTANT}
     readable = inspection.joint.kind is not None and _complete(inspection, tables)

@@ -45,7 +45,8 @@ _USUAL_RATIOS, _POSSIBLE_RATIOS = (25.0, 330.0), (4.0, 1100.0)
 _RATE_TOLERANCE = 0.03
 _ABOUT_ONE = 0.15  # limits of reduction ratios
 _WHOLE_TOLERANCE = 2e-3
-_COPY = 5.0  # odds of proportionality above which two columns are the same channel
+COPY = 5.0
+"""Log odds of proportionality above which a column counts as a copy of another."""
 _MOST_FRAMES = 2000  # likeliest assignments of angles that are weighed with the other columns; all of twelve columns
 _NEARLY = 12.0  # hypotheses less likely than the best by this much are dropped
 
@@ -264,7 +265,7 @@ def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[s
     for hypothesis, weight in zip(found, weights, strict=True):
         for signal, k in hypothesis.columns.items():
             for column in {k, found[0].columns.get(signal, k)}:
-                if column == k or evidence.relations.proportional(column, k).odds > _COPY:
+                if column == k or evidence.relations.proportional(column, k).odds > COPY:
                     own = shares.setdefault(column, {})
                     own[signal] = own.get(signal, 0.0) + float(weight)
     best = found[0]

@@ -9,18 +9,17 @@ import numpy as np
 
 from fitting.errors import InputError
 from fitting.inspection.columns import Column, Table
-from fitting.inspection.hypotheses import ANGLES, OTHERS, Evidence, hypotheses, readings, weighed
+from fitting.inspection.hypotheses import ANGLES, COPY, OTHERS, Evidence, hypotheses, readings, weighed
 from fitting.inspection.reasons import physical_reasons
 from fitting.inspection.relations import Relations
 from fitting.inspection.settling import SURE, RatioGuess, UnitGuess, ratio_of, signs_of, units_of
-from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time, own_stamps
+from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time, own_base
 from fitting.inspection.unit_evidence import is_counts, si_size
 from fitting.inspection.windows import Uniform, scales, uniform
 from fitting.logs.channels import SI
 from fitting.logs.units import convert
 from fitting.logs.unwrapping import unwrapped_angle
 
-_COPY = 5.0  # log odds of proportionality above which a column counts as a copy of another
 _RIVAL, _WORTH_A_WORD = (
     0.05,
     0.3,
@@ -188,6 +187,11 @@ def _inspected(tables: Sequence[Table], joint: str | None) -> Inspection:
     return Inspection(tuple(tables), clocks, time, joints, _chosen(joints, joint, first.path))
 
 
+def confidence_percent(share: float) -> str:
+    """A confidence as text; nothing is certain."""
+    return f"{100 * min(share, 0.99):.0f} %"
+
+
 def alike(tables: Sequence[Table]) -> list[tuple[Table, ...]]:
     """Tables in groups with the same columns."""
     groups: dict[frozenset[str], list[Table]] = {}
@@ -268,8 +272,8 @@ def _as_others(joint: JointInspection, joints: Sequence[JointInspection], table:
 def _samples(table: Table, name: str, clock: Clock, time: TimeGuess) -> tuple[np.ndarray, np.ndarray | None]:
     """The values of a column and its stamps, or those of the table's clock."""
     column = table.column(name)
-    values, own = _unwrapped(column), own_stamps(table, column, time)
-    return (values, own) if own is not None else (values[clock.base.rows], None)
+    values, own = _unwrapped(column), own_base(table, column, time)
+    return (values[clock.base.rows], None) if own is None else (values[own.rows], own.time)
 
 
 def _is_of(column: Column, label: str | None, labels: tuple[str, ...]) -> bool:
@@ -322,7 +326,7 @@ def _copies(evidence: Evidence, taken: set[int]) -> dict[str, tuple[str, float]]
             continue
         told = {i: evidence.relations.proportional(k, i) for i in taken}
         i = max(told, key=lambda i: told[i].odds, default=None)
-        if i is not None and told[i].odds > _COPY:
+        if i is not None and told[i].odds > COPY:
             copies[column.name] = (evidence.columns[i].name, told[i].slope)
     return copies
 

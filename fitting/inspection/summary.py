@@ -6,7 +6,7 @@ import numpy as np
 
 from fitting.inspection.drive_text import unknowns
 from fitting.inspection.excitation import Excitation
-from fitting.inspection.inspection import Inspection, JointInspection
+from fitting.inspection.inspection import Inspection, JointInspection, confidence_percent
 from fitting.inspection.resonances import COHERENT
 from fitting.logs.findings import Finding
 
@@ -22,15 +22,15 @@ def column_rows(inspection: Inspection) -> list[Row]:
     joint, time = inspection.joint, inspection.time
     rows: list[Row] = []
     if time.column is not None:
-        rows.append((time.column, "time", time.unit, "", _percent(time.confidence), "; ".join(time.reasons)))
+        rows.append((time.column, "time", time.unit, "", confidence_percent(time.confidence), "; ".join(time.reasons)))
     for signal, guess in joint.signals.items():
         unit = guess.unit or (
             "?" if signal.endswith("_angle") else "as logged" if signal in _ANY_UNIT else "SI assumed"
         )
         sign = "-1" if guess.sign < 0 else ""
-        rows.append((guess.column, signal, unit, sign, _percent(guess.confidence), guess.why))
+        rows.append((guess.column, signal, unit, sign, confidence_percent(guess.confidence), guess.why))
     for column, shares in joint.open.items():
-        could_be = " or ".join(f"{s} ({_percent(w)})" for s, w in shares.items())
+        could_be = " or ".join(f"{s} ({confidence_percent(w)})" for s, w in shares.items())
         rows.append((column, "?", "", "", "", f"could be {could_be}"))
     for column, (other, times) in joint.copies.items():
         rows.append((column, "", "", "", "", f"follows '{other}', times {times:.4g}"))
@@ -65,10 +65,6 @@ def inspection_text(
     if missing:
         lines += ["", "To fill in in the drive file:", *(f"  {key}: {why}" for key, why in missing.items())]
     return "\n".join(lines)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * min(share, 0.99):.0f} %"
 
 
 def _sampling(inspection: Inspection, k: int) -> str:

@@ -140,11 +140,20 @@ def _clocks(table: Table, first: str) -> dict[str, str]:
     return clocks
 
 
-def own_stamps(table: Table, column: Column, guess: TimeGuess) -> np.ndarray | None:
-    """The stamps [s] of a column with a separate clock, NaN where blank; None if it has the table's."""
-    if column.name not in guess.clocks:
-        return column.time
-    return table.column(guess.clocks[column.name]).values * float(convert(np.array(1.0), guess.unit, "s"))
+def own_base(table: Table, column: Column, guess: TimeGuess) -> TimeBase | None:
+    """The time base of a column with a separate clock, without rows where it is none; None if it has the table's."""
+    stamps = column.time
+    if column.name in guess.clocks:
+        stamps = table.column(guess.clocks[column.name]).values * float(convert(np.array(1.0), guess.unit, "s"))
+    if stamps is None:
+        return None
+    # The shorter channel of a table ends in blanks.
+    stamps = stamps[: int(np.max(np.flatnonzero(np.isfinite(stamps)), initial=-1)) + 1]
+    rows = np.arange(len(stamps))
+    try:
+        return time_base(stamps, rows[:, None], path=table.path, name=column.name, second=1.0, first_row=0)
+    except InputError:
+        return TimeBase(rows[:0], stamps[:0], rows[:0], ())
 
 
 def clock_of(table: Table, guess: TimeGuess) -> Clock:
@@ -156,11 +165,11 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
         except InputError:
             pass
     step = 1.0 / table.sample_rate if table.sample_rate else 1.0
-    stamps = [column.time for column in table.columns if column.time is not None]
-    if stamps:
-        # The fastest clock has the finest grid.
-        finest = max(stamps, key=len)
-        return Clock(TimeBase(np.arange(len(finest)), finest, np.zeros(0, dtype=int), ()), True)
+    bases = [base for column in table.columns if (base := own_base(table, column, guess)) is not None]
+    # The fastest clock has the finest grid.
+    finest = max(bases, key=lambda base: len(base.rows), default=None)
+    if finest is not None and len(finest.rows):
+        return Clock(finest, True)
     return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None)
 
 
@@ -182,7 +191,10 @@ def _base(table: Table, guess: TimeGuess) -> TimeBase:
 def sampling_findings(table: Table, guess: TimeGuess) -> tuple[Finding, ...]:
     """Corrections of the stamps, or why there are none."""
     if guess.column is None:
-        return ()
+        own = [own_base(table, column, guess) for column in table.columns]
+        wrong = [c.name for c, base in zip(table.columns, own, strict=True) if base is not None and not len(base.rows)]
+        told = "the stamps are constant, run backwards or are blank"
+        return tuple(Finding("refusal", told, name, "the column has no time base") for name in wrong)
     try:
         return _base(table, guess).findings
     except InputError as error:

@@ -15,6 +15,7 @@ from fitting.logs.units import UnitError, convert
 # Names of scalar sample rates beside the data in MATLAB and HDF5 files.
 _RATE_NAMES = ("fs", "Fs", "FS", "sample_rate", "sampling_rate", "sampling_frequency", "SampleRate")
 _STEP_NAMES = ("Ts", "dt", "sample_time")
+_STEP_UNIT = "TimeUnit"
 _UNIT_NAMES = ("unit", "units", "Unit", "Units")
 _DEEPEST = 12
 
@@ -67,7 +68,7 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
             if name.startswith("#") or depth > _DEEPEST:
                 return
             if isinstance(item, h5py.Group):
-                keys = [key for key in (*_RATE_NAMES, *_STEP_NAMES) if key in item.attrs]
+                keys = [key for key in (*_RATE_NAMES, *_STEP_NAMES, _STEP_UNIT) if key in item.attrs]
                 rates.update({f"{name}/{key}".lstrip("/"): (item.attrs[key], None) for key in keys})
                 if depth:
                     item.visititems(lambda inner, of: note(f"{name}/{inner}", of, depth))
@@ -95,7 +96,7 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
             if "MATLAB_object_decode" in item.attrs:
                 raise not_numbers(path, name, "is a table or object of MATLAB's own", "save its columns as vectors")
             if item.attrs.get("MATLAB_class") == b"char":
-                raise not_numbers(path, name, "is text")
+                return "".join(map(chr, np.ravel(item[()])))
             return item[()] if field is None else item[field]
 
         def unit(name: str) -> str | None:
@@ -196,7 +197,7 @@ def _place(path: Path, asked: str, held: Mapping[str, Any], parting: str) -> tup
     if number and len(names) == 1:
         return names[0], int(number[1]) - 1
     if number:
-        return (names[int(number[1]) - 1] if int(number[1]) <= len(names) else None), None
+        return dict(enumerate(names, start=1)).get(int(number[1])), None
     match = re.fullmatch(r"(.*)\(\s*:\s*,\s*([0-9]{1,6})\s*\)", asked)
     plain, column = (match[1], int(match[2]) - 1) if match else (asked, None)
     plain = plain.strip("/")
@@ -247,15 +248,14 @@ def _rate(get: Callable[[str], Any]) -> float | None:
     for name in (*_RATE_NAMES, *_STEP_NAMES):
         array = np.asarray(get(name))
         if array.size == 1 and array.dtype.kind in "iuf" and 0 < array.item() < np.inf:
-            return (
-                float(array.item()) if name in _RATE_NAMES else 1.0 / (float(array.item()) * _second(get("TimeUnit")))
-            )
+            value = float(array.item())
+            return value if name in _RATE_NAMES else _rate_of_step(value, _text(get(_STEP_UNIT)))
     return None
 
 
-def _second(unit: Any) -> float:
-    """A unit of time, as MATLAB spells it, in seconds; one where there is none."""
+def _rate_of_step(step: float, unit: str | None) -> float | None:
+    """Samples per second; None where the unit is not known."""
     try:
-        return float(convert(np.array(1.0), str(unit), "s"))
+        return 1.0 / (step * float(convert(np.array(1.0), unit or "s", "s")))
     except UnitError:
-        return 1.0
+        return None

@@ -43,6 +43,9 @@ def _series(path: Path, name: str, values: Any) -> pl.Series:
     array = np.asarray(values)
     if array.ndim != 1:
         raise not_numbers(path, name, f"has {array.ndim} dimensions")
+    if array.dtype.kind in "mM":
+        # Polars knows days, and milliseconds or finer.
+        array = array.astype(f"{array.dtype.kind}8[ns]")
     try:
         return pl.Series(name, array.tolist() if array.dtype == object else array)
     except (TypeError, pl.exceptions.PolarsError) as error:

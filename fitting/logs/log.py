@@ -172,7 +172,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     refuse_repeated(path, drive_file, table)
     kind = kind_of(path, drive_file, table, raw)
     required = needed_signals(kind, raw, drive_file)
-    joined = (*joined, *(told_of_subset(path, drive_file, table, raw) if kind == "drive" else ()))
+    joined = (*joined, *(told_of_subset(drive_file, table, raw) if kind == "drive" else ()))
     raw, start, stop, told = _inhabited(path, drive_file, table, raw, required)
     asked, outputs_until = outputs_until, _rows_until(outputs_until, raw, required[:-1], start)
     channels = {}

@@ -96,9 +96,7 @@ def _unnamed(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn
     return [name for name in table.names if split_unit(name)[0] not in taken]
 
 
-def told_of_subset(
-    path: Path, drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]
-) -> tuple[Finding, ...]:
+def told_of_subset(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]) -> tuple[Finding, ...]:
     """Finding on a drive log that lacks an angle: its fitted outputs, and columns that may be the angle."""
     seen, lacks = drive_outputs(raw), [angle for angle, _ in SIDES if angle not in raw]
     if not lacks or not seen:

@@ -56,7 +56,7 @@ def read_mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
 
         summary = reader.get_summary()
         known = None if summary is None else tuple(channel.topic for channel in summary.channels.values())
-        return _table(path, known, messages, wanted)
+        return _table(known, messages, wanted)
 
 
 def read_bag(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
@@ -83,7 +83,7 @@ def read_bag(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
             for connection, time, raw in reader.messages(connections=chosen) if chosen else ():
                 yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
 
-        return _table(path, tuple(dict.fromkeys(c.topic for c in reader.connections)), messages, wanted)
+        return _table(tuple(dict.fromkeys(c.topic for c in reader.connections)), messages, wanted)
 
 
 def _is_readable(schema: Any, channel: Any) -> bool:
@@ -115,7 +115,6 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
 
 
 def _table(
-    path: Path,
     topics: tuple[str, ...] | None,
     messages: Callable[[Iterable[str] | None], Iterator[Message]],
     wanted: tuple[str, ...],

@@ -100,7 +100,7 @@ def time_base(
     mender = _Mender(name, stamps, first_row)
     _unwrap(mender, second)
     _drop_doubled(mender, samples)
-    _order(mender, samples)
+    _order(mender)
     _fill_blanks(mender)
     _spread_coarse(mender)
     _tell_of_counting(mender)
@@ -176,7 +176,7 @@ def _irregular(step: np.ndarray, typical: float) -> int:
     return int(np.sum(np.abs(step / typical - 1) > _IRREGULAR))
 
 
-def _order(mender: _Mender, samples: np.ndarray) -> None:
+def _order(mender: _Mender) -> None:
     """Sort late rows in; append a restarted recording to the one before."""
     known = np.flatnonzero(np.isfinite(mender.time))
     time = mender.time[known]

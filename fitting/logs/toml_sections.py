@@ -1,11 +1,10 @@
 """Sections of a TOML file and their keys, with one-sentence errors."""
 
+import sys
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from fitting.errors import InputError
 
@@ -16,11 +15,11 @@ class Sections:
     def __init__(self, path: Path, names: Collection[str]):
         self.path = path
         try:
-            self._content = tomllib.loads(path.read_text(encoding="utf-8"))
+            self._content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         except OSError as error:
             raise InputError(f"{path}: the file can't be read ({error.strerror}); check the path") from error
-        except ValueError as error:
-            raise InputError(f"{path}: not a TOML file ({error})") from error
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: not a TOML file, correct it: {' '.join(str(error).split())}") from error
         self.known("", self._content, names)
 
     def section(self, name: str) -> dict[str, Any]:
@@ -52,7 +51,8 @@ class Sections:
 
     def number(self, section: str, key: str, value: object) -> float:
         """A finite number."""
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        # Integers of TOML may be larger than any float.
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
             raise self.refuse(f"[{section}] {key} must be a number, but is {value!r}")
         return float(value)
 
@@ -69,6 +69,6 @@ class Sections:
 
     def one_of(self, section: str, key: str, value: object, names: Collection[str]) -> Any:
         """One of several words."""
-        if value not in names:
+        if not isinstance(value, str) or value not in names:
             raise self.refuse(f"[{section}] {key} must be one of {', '.join(names)}, but is {value!r}")
         return value

@@ -222,10 +222,7 @@ def _judged(
     chosen = {path: float(v) for path, v in values(study.variables, jnp.asarray(shares)).items()}
     labels = [part.label for part in (*study.terms, *study.limits)]
     if not (np.isfinite(rows).all() and np.isfinite(slopes).all()):
-        nothing: dict[str, float] = {}
-        return Optimum(
-            Outcome.lost, shares, chosen, np.inf, {}, {}, {}, {}, dict(nothing), dict(nothing), np.inf, asked
-        )
+        return Optimum(Outcome.lost, shares, chosen, np.inf, {}, {}, {}, {}, {}, {}, np.inf, asked)
     excess = {limit.label: float(rows[1 + i]) for i, limit in enumerate(study.limits)}
     low, high = shares <= _AT_BOUND, shares >= 1.0 - _AT_BOUND
     active = rows[1:] > -_ACTIVE

@@ -70,9 +70,10 @@ class ResponseMeasure(SpeedRange):
         for effect in errors if rotating else ():
             if "theta_l" in effect.angles:
                 raise ValueError(f"`{self.name}` rests on harmonic balance, but {effect.name} has a longer period")
-            if isinstance(effect, KinematicHarmonic) and float(effect.n) > HARMONICS:
+            if isinstance(effect, KinematicHarmonic) and not (effect.repeats() and float(effect.n) <= HARMONICS):
                 raise ValueError(
-                    f"`{self.name}` balances orders up to {HARMONICS}, but {effect.name} has order {float(effect.n):g}"
+                    f"`{self.name}` balances whole orders up to {HARMONICS}, but {effect.name} has order "
+                    f"{float(effect.n):g}"
                 )
 
 

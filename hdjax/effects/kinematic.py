@@ -19,6 +19,8 @@ from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Ghorbel, Gandhi, Alpeter 2001; vendors: 1.5e-4 to 5.8e-4 rad peak to peak"
 PLAUSIBLE = (0.0, 2.9e-4)
+# Deviation of a fitted order from a whole number (assumed).
+_WHOLE = 1e-3
 
 
 class KinematicError(MeshGeometryEffect):
@@ -79,6 +81,10 @@ class KinematicHarmonic(MeshGeometryEffect):
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n) for n in (6.0, 3.0, 8.0, 5.0, 10.0, 12.0))
+
+    def repeats(self) -> bool:
+        """Whether its order is whole, up to the accuracy of a fit, so that it repeats with the motor's revolution."""
+        return float(self.n) > 0.5 and abs(float(self.n) - round(float(self.n))) < _WHOLE
 
     def error(self, theta_m: Array) -> Array:
         return ripple(theta_m, self.n, self.cosine, self.sine)

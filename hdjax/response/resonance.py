@@ -33,12 +33,12 @@ class Peak(eqx.Module):
 
 @eqx.filter_jit
 def peak(branch: Branch, *, harmonic: int | None = None) -> Peak:
-    """Largest dynamic error of a branch; value and amplitude have gradients by drive and forcing.
+    """The largest motion of a branch about its mean; value and amplitude have gradients by drive and forcing.
 
     Args:
         branch: from [`hdjax.response.frequency_response`][] or [`hdjax.response.follow`][].
         harmonic: the harmonic of the motion that shall be largest (3 for a super-harmonic peak, for instance); the
-            mean square of the whole motion where not given.
+            motion's mean square about its mean where not given.
     """
     H = branch.system.harmonics
     n = branch.unknowns.shape[1]

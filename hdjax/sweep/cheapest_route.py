@@ -52,7 +52,8 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
             float(np.median(errors)) if errors.size else math.nan,
             reference.description,
         )
-        if check.error <= request.tolerance or attempts == 1:
+        # Where no point could be checked, the error is NaN.
+        if not check.error > request.tolerance or attempts == 1:
             break
         if route.method == "adaptive":
             route = dataclasses.replace(route, tolerance=0.1 * route.tolerance)

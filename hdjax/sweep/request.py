@@ -116,15 +116,20 @@ class Case(eqx.Module):
         for path in points.paths:
             if path not in known:
                 raise ValueError(f"`{path}` is no parameter of this sweep; there are {', '.join(known)}")
-        # Bounds of the drive's parameters; an effect may be swept from its absence, the end of its interval.
-        limits = {path: info.bounds for path, (_, info) in parameters.items() if "." not in path}
+        limits = {path: info.bounds for path, (_, info) in parameters.items()}
         if request.response == "steady" or request.periods is not None:
             limits[FORCING + "omega"] = (0.0, math.inf)
         for path, (low, high) in limits.items():
             values = points.column(path)
             if path in parameters and values is None:
                 values = np.atleast_1d(parameters[path][0])
-            if values is not None and not np.all((values > low) & (values < high)):
+            if values is None:
+                continue
+            inside = (values > low) & (values < high)
+            if path in parameters and "." in path:
+                # An effect may be swept from its absence, the end of its interval.
+                inside |= (values == low) | (values == high)
+            if not np.all(inside):
                 span = f"{np.min(values):g} to {np.max(values):g}"
                 raise ValueError(f"`{path}` must lie between {low:g} and {high:g}, but runs from {span}")
 

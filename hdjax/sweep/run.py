@@ -84,6 +84,10 @@ def opened(folder: Path, case: Case, request: Request, *, memory: int = _MEMORY)
     if chosen is None:
         chosen = plan(case, request)
         kept = Store(folder, case, request, chunk=_chunk_points(request, chosen, memory))
+        # Another process may have begun the same request meanwhile.
+        begun = kept.plan
+        if begun is not None:
+            return kept, begun
         kept.begin(chosen)
     return kept, chosen
 

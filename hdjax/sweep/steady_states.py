@@ -266,7 +266,8 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     for attempts in range(_ATTEMPTS, 0, -1):
         route = dataclasses.replace(route, harmonics=_LADDER[rung])
         check = _checked(case, steady_states(case, route, others), route, others)
-        if check.error <= request.tolerance or attempts == 1:
+        # Where no point could be checked, the error is NaN.
+        if not check.error > request.tolerance or attempts == 1:
             break
         rung = min(rung + 1, len(_LADDER) - 1)
         route = dataclasses.replace(route, truncation=0.1 * route.truncation)

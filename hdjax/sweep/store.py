@@ -8,6 +8,7 @@ must have the same path for them.
 import json
 import os
 import platform
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,8 @@ class Store:
     def begin(self, plan: Plan) -> None:
         """Create the arrays; the plan is written last, as a mark that they exist."""
         zarr = required("zarr")
+        # Marks that outlived their plan say nothing of the new arrays.
+        shutil.rmtree(self.path / _MARKS, ignore_errors=True)
         group = zarr.open_group(self.path / "data", mode="w")
         points = self._request.points.size
         lengths = {name: len(coordinate) for name, coordinate in extra_dims(self._request, plan).items()}

@@ -15,6 +15,7 @@ from invocation import run
 import rig
 from fitting.commands import main as command_line
 from hdjax import hdc_40_050
+from hdjax.effects.kinematic import KinematicHarmonic
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -184,6 +185,7 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "speeds into a file": (("speeds", "--out", "log.csv/below"), ("--out", "log.csv")),
     "negative damping": (("speeds", "--B_sp", "-0.1"), ("--B_sp", "-0.1")),
     "speeds of a reduced model": (("speeds", "--model", "reduced.json"), ("reduced.json", "two inertias")),
+    "speeds of an order that is not whole": (("speeds", "--model", "ripple.json"), ("ripple.json", "kinematic_harmonic")),
     "speeds of a broken model": (("speeds", "--model", "broken.json"), ("broken.json",)),
     "speeds without a range": (("speeds", "--slowest", "500", "--fastest", "500"), ("--slowest", "--fastest")),
     "speed without end": (("speeds", "--fastest", "inf"), ("--fastest", "inf")),
@@ -205,6 +207,9 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
         ("--largest-speed", "no motor"),
     ),
     "limits of no experiment": ((*FIT, "--largest-torque", "1"), ("--largest-torque", "--next-experiment")),
+    "negative seed": (("simulate", "--out", "out", "--seed", "-1"), ("--seed", "-1")),
+    "huge seed of a search": (("close-loop", *FIT[1:], "--seed", "99999999999"), ("--seed", "99999999999")),
+    "log that is a folder": (("simulate", "--out", "."), ("--out", "folder")),
     "tables with an option": (("seed-tables", "--out", "out"), ("--out",)),
 }
 
@@ -222,6 +227,8 @@ def test_invalid_arguments_are_refused_in_one_line(
     (tmp_path / "typo.toml").write_text("[drive]\nreduction_ratoi = 50\n", encoding="utf-8")
     (tmp_path / "broken.json").write_text('{"schema": "hdjax-model/1"', encoding="utf-8")
     write_model(tmp_path, rig.reduced_model()).rename(tmp_path / "reduced.json")
+    ripple = KinematicHarmonic(cosine=1e-4, n=2.5)
+    write_model(tmp_path, rig.drive_model().with_effects(ripple)).rename(tmp_path / "ripple.json")
     write_model(tmp_path, rig.drive_model())
     before = sorted(p.name for p in tmp_path.iterdir() if p.name != "cache")
     assert run(*arguments) == 2

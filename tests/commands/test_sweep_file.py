@@ -65,6 +65,10 @@ def test_sweep_file_defines_model_forcing_and_points(tmp_path):
         ("tolerance = 1e-5", "tolerance = 2.0", "`tolerance` must lie between"),
         ("K = {", '"B_sp" = {', "`B_sp` must be an axis or a column of the sample, but is both"),
         ("[drive]", "[drive", "not a TOML file"),
+        ("alpha = 50.0", f"alpha = {'[' * 2000}", "not a TOML file"),
+        ("alpha = 50.0", f"alpha = 1{'0' * 400}", r"\[drive\] alpha must be a number"),
+        ('"steady"', '["steady"]', r"\[sweep\] response must be one of"),
+        ("k2 = 0.5", "k2 = 0.5\n[effects.dahl]\nyield_twist = -1e-4", r"\[effects.dahl\] yield_twist must lie within 0"),
     ],
 )
 def test_invalid_sweep_file_is_refused_in_one_sentence(tmp_path, old, new, words):
@@ -72,6 +76,12 @@ def test_invalid_sweep_file_is_refused_in_one_sentence(tmp_path, old, new, words
     with pytest.raises(InputError, match=words) as refusal:
         read_sweep_file(path)
     assert str(refusal.value).startswith(str(path)) and "\n" not in str(refusal.value)
+
+
+def test_byte_order_mark_of_a_sweep_file_is_skipped(tmp_path):
+    path = tmp_path / "sweep.toml"
+    path.write_text(GOOD, encoding="utf-8-sig")
+    assert float(read_sweep_file(path).model.drive.alpha) == 50.0
 
 
 def test_missing_sweep_file_is_refused(tmp_path):

@@ -107,7 +107,12 @@ def test_fold_distance_is_the_log_ratio_to_the_nearest_fold(found: tuple[np.ndar
 
 
 @pytest.mark.parametrize(
-    ("error", "why"), [(KinematicSidebands(ratio=50.0), "longer period"), (KinematicHarmonic(n=6.0), "up to 5")]
+    ("error", "why"),
+    [
+        (KinematicSidebands(ratio=50.0), "longer period"),
+        (KinematicHarmonic(n=6.0), "up to 5"),
+        (KinematicHarmonic(n=2.5), "whole orders"),
+    ],
 )
 def test_kinematic_errors_that_the_balance_can_not_carry_are_refused(error: MeshGeometryEffect, why: str):
     at = Case(TwoInertiaModel(case().drive, (error,)))

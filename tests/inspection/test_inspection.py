@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -14,6 +15,9 @@ from simulated_joint import Motion, simulated
 
 import fitting
 from fitting import DataError, InputError
+from fitting.inspection.columns import read_columns
+from fitting.inspection.inspection import inspect_tables
+from fitting.inspection.time_column import sampling_findings
 
 matplotlib.use("Agg")
 
@@ -191,6 +195,28 @@ def test_text_and_blank_columns_are_reported_as_left_out(tmp_path: Path, drive_l
         fitting.inspect(tmp_path / "text.csv")
     with pytest.raises(InputError, match="there is no log"):
         fitting.inspect([])
+
+
+@pytest.mark.parametrize("kind", ["batched", "jumping back", "constant"])
+def test_own_clocks_of_channels_are_mended_or_refused(kind: str, drive_log: dict[str, np.ndarray]):
+    time = drive_log["time"]
+    stamps = {
+        "batched": np.repeat(time[9::10], 10)[: len(time)],
+        "jumping back": time - 0.3 * time[-1] * (time > 0.5 * time[-1]),
+        "constant": np.zeros_like(time),
+    }[kind]
+    table = read_columns(Path("recording"), {name: c for name, c in drive_log.items() if name != "time"})
+    own = tuple(replace(c, values=c.values[: len(stamps)], time=stamps) for c in table.columns)
+    found = inspect_tables([replace(table, columns=own)])
+    told = sampling_findings(found.tables[0], found.time)
+    if kind == "batched":
+        assert found.rates[0] == pytest.approx(1.0 / np.diff(time).mean(), rel=1e-2)
+        assert not told
+    elif kind == "constant":
+        assert found.rates == (None,)
+        assert [finding.severity for finding in told] == ["refusal"] * len(own)
+    else:
+        assert all(np.all(np.diff(clock.base.time) > 0) for clock in found.clocks)
 
 
 def test_matrix_columns_of_a_mat_file_are_inspected(tmp_path: Path, motion: Motion):

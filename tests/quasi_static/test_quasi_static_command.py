@@ -207,6 +207,7 @@ def test_close_loop_reports_that_the_linear_curve_suffices(tmp_path: Path, capsy
         (table() | {"twist": np.full(400, 1e-3)}, [], 1, "dynamic_error"),
         (table(), ["--max-effects", "-1"], 2, "--max-effects"),
         (table(), ["--next-experiment"], 2, "quasi-static"),
+        (table(), ["--posterior"], 2, "quasi-static"),
     ],
 )
 def test_close_loop_refuses_invalid_input_in_one_sentence(

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hdjax import PRESETS, Drive, ReducedDrive, ReducedModel, TwoInertiaModel, hdc_40_050
 from hdjax.effects import BY_NAME, CATALOGUE, FAMILIES, Scales
 from hdjax.effects.backlash import Backlash
+from hdjax.effects.creep import Creep
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.parameters import own_parameters
@@ -202,6 +203,12 @@ def test_effects_are_added_and_removed():
     assert [e.name for e in less.effects] == ["coulomb_friction", "backlash"]
     assert "kinematic_error.cos_2" not in less.parameters()
     assert len(model.effects) == 2
+
+
+def test_effects_with_memory_of_one_name_are_refused():
+    both = Creep(tau=0.1, span=1e-3), Creep(tau=1.0, span=1e-3)
+    with pytest.raises(ValueError, match="effects with memory must have different names, but are creep, creep"):
+        TwoInertiaModel(hdc_40_050(), both)
 
 
 @pytest.mark.parametrize("form", CATALOGUE)

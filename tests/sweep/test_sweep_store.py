@@ -83,6 +83,13 @@ def test_transient_sweep_has_the_steady_peak_and_a_settling_time():
     assert (found.peak >= 0.99 * steady.peak.max("motion")).all()
 
 
+def test_marks_of_a_lost_plan_do_not_count(tmp_path):
+    kept = started_store(tmp_path)
+    kept.write(0, {"final": np.ones((CHUNK, 2))})
+    (kept.path / "plan.json").unlink()
+    assert not started_store(tmp_path).finished().any()
+
+
 def test_finished_chunk_is_not_computed_again(tmp_path, monkeypatch):
     first = sweep(CASE.model, CASE.forcing, steady_request(), store=tmp_path)
     monkeypatch.setattr("hdjax.sweep.run.work", lambda *_: pytest.fail("a finished chunk was worked out"))
