@@ -1,5 +1,6 @@
 """Preparation of a drive file and its logs: the base model, and the logs under each hold of the torque."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +37,6 @@ class Rig(eqx.Module):
         test: the same of the test data.
         logs: as fitted, without test data.
         findings: of the health check, by log.
-        error_unit: unit of the dynamic error.
     """
 
     name: str = eqx.field(static=True)
@@ -46,7 +46,6 @@ class Rig(eqx.Module):
     test: dict[Hold, tuple[Experiment, ...]]
     logs: tuple[Log, ...] = eqx.field(static=True)
     findings: dict[str, tuple[Finding, ...]] = eqx.field(static=True)
-    error_unit: str = eqx.field(static=True)
 
 
 def read_rig(
@@ -104,7 +103,6 @@ def rig_of(
         },
         logs=fitted,
         findings=findings,
-        error_unit=fitted[0].units.get("dynamic_error", "rad"),
     )
 
 
@@ -185,10 +183,13 @@ def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment
 
 def _with_own_names(logs: Sequence[Log]) -> tuple[Log, ...]:
     """Logs of the same name are distinguished by their folder, and then by a number."""
-    named: list[Log] = []
-    for log in logs:
-        alike = sum(log.path.stem == other.path.stem for other in logs) > 1
-        name = f"{log.path.absolute().parent.name}/{log.name}" if alike else log.name
-        before = sum(other.name.split(" (")[0] == name for other in named)
-        named.append(replace(log, name=f"{name} ({before + 1})" if before else name))
-    return tuple(named)
+    stems = [log.path.stem for log in logs]
+    wanted = [
+        f"{log.path.absolute().parent.name}/{log.name}" if stems.count(stem) > 1 else log.name
+        for log, stem in zip(logs, stems, strict=True)
+    ]
+    names: list[str] = []
+    for name in wanted:
+        free = (f"{name} ({number})" for number in itertools.count(2))
+        names.append(name if name not in names else next(n for n in free if n not in (*names, *wanted)))
+    return tuple(replace(log, name=name) for log, name in zip(logs, names, strict=True))

@@ -160,13 +160,13 @@ class _Closed:
     def _findings(self, after: Account) -> tuple[Finding, ...]:
         """The accepted effects with their final values, largest gain first; a learned term comes last."""
         end = self.end
-        by_name = rms_error(end.runs) if end.unknown is None else self._rmse(end.trusted)
+        by_name = self._rmse(end.trusted)
         rmse_without = {name: self._rmse(trial) for name, trial in self._without().items()}
         findings = _named_findings(self.found.rounds, after.model, by_name, rmse_without)
         if end.unknown is None:
             return findings
         effect = after.model.effect(end.unknown.chosen.form.name)
-        gain = _gain(rms_error(end.runs), by_name)
+        gain = _gain(self._rmse(end.final), by_name)
         return (*findings, Finding(effect, effect.name, effect.family, gain, end.unknown.p_value))
 
     def _without(self) -> dict[str, Trial]:
@@ -176,7 +176,7 @@ class _Closed:
             return without
         fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
         kept = [] if trusted is base else [name for name in without if name not in fallen]
-        if len(kept) == 1:
+        if len(kept) == 1 and trusted.hold == base.hold:
             return {kept[0]: base}
         return {name: refitted_without([name], trusted, base, self.study) for name in kept}
 

@@ -37,6 +37,12 @@ def test_logs_of_equal_name_get_distinct_names(tmp_path: Path, drive: Path):
     assert [e.name for e in found.experiments["linear"]] == names
 
 
+def test_numbers_of_names_are_those_of_no_file(tmp_path: Path, drive: Path):
+    paths = [write(tmp_path / "a", name, i) for i, name in enumerate(("run (2).csv", "run.csv"))]
+    names = [log.name for log in read_rig([*paths, paths[1], paths[1]], drive).logs]
+    assert names == ["run (2)", "a/run", "a/run (2)", "a/run (3)"]
+
+
 def test_logs_of_two_kinds_are_refused(tmp_path: Path, drive: Path):
     with pytest.raises(InputError, match="can't be fitted together"):
         read_rig([write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 4)], drive)

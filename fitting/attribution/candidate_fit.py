@@ -26,6 +26,8 @@ _TRIAL_STEPS = 25
 _CONTINUED = Strategy(_TRIAL_STEPS, begin_anew_above=np.inf, retry_states=False)
 # Iterations that rank the starts.
 _FIRST_STEPS = replace(_CONTINUED, max_steps=12, give_up_above=-np.inf)
+# Longest delay or lag of the torque [s].
+_LONGEST_DELAY = 1e-2
 # Share of the required gain that a first pass must reach; hidden states may converge later.
 _MOST_OF_THE_WAY = 2.0 / 3.0
 
@@ -248,12 +250,7 @@ def long_gains(before: Trial, trials: Sequence[Trial]) -> list[float] | None:
     return [float(first - objective) if np.isfinite(objective) else -np.inf for objective in others]
 
 
-def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int:
-    """Intervals of torque before each segment.
-
-    Args:
-        training: training stretches.
-        longest_delay: of a delayed or lagging torque [s].
-    """
+def halo_for(training: Sequence[Stretch]) -> int:
+    """Intervals of torque before each segment of training stretches."""
     step = min(stretch.experiment.time_step for stretch in training)
-    return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))
+    return int(np.clip(np.ceil(_LONGEST_DELAY / step) + 1, 4, 64))

@@ -86,16 +86,15 @@ def tie(name: str, behind: Float[np.ndarray, " blocks"], lost: float = np.inf, r
     return Check("tie_level", name, statistic, limit, statistic <= limit)
 
 
-def compete(best: Rival, others: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, ...]:
+def compete(best: Rival, others: Sequence[Rival]) -> tuple[Rival, ...]:
     """The candidates that compete over whole stretches: the best one and its ties; all where the best one has memory,
     whose states are free on short segments.
 
     Args:
         best: the candidate with the largest gain over short segments.
         others: the others.
-        rules: the thresholds.
     """
-    return best, *(r for r in others if r.gain > rules.least_gain and (r.tied or best.remembers))
+    return best, *(r for r in others if r.gain > RULES.least_gain and (r.tied or best.remembers))
 
 
 def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, tuple[str, ...]]:

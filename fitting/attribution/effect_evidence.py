@@ -7,8 +7,9 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.estimate import Fit
 from fitting.estimation.projection import solved
-from fitting.first_order.gains import Acting, LinearisedFit, linearise_along, products
+from fitting.first_order.gains import LinearisedFit, linearise_along, products
 from fitting.first_order.motion import place_of
+from fitting.uncertainty.innovations import spread_evenly
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,
@@ -72,20 +73,23 @@ def _evidence(look: LinearisedFit, effect: Effect) -> Evidence | None:
     value = np.array(getattr(look.motion, effect.drawn_against))
     does = at_instants(_done, (look.followed.states, 2), ((effect.name, look.model), 0), (look.motion, 2))
     weight = np.asarray(look.problem.segments.weight)
+    known = np.isfinite(value) & np.isfinite(does)
     # The last knot of a segment is the first one of the next segment.
-    kept = (np.pad(weight, ((0, 0), (0, 1))) > 0) & np.isfinite(value) & np.isfinite(does)
+    kept = (np.pad(weight, ((0, 0), (0, 1))) > 0) & known
     if effect.drawn_against in ANGLES and np.ptp(value[kept]) > 2 * np.pi:
         value = np.mod(value, 2 * np.pi)
     if not np.ptp(value[kept]) > 0:
         return None
     some = np.flatnonzero(kept)
-    some = some[np.unique(np.linspace(0, some.size - 1, min(_INSTANTS, some.size)).astype(int))]
+    some = some[spread_evenly(some.size, _INSTANTS)]
     at, done = value.reshape(-1)[some], does.reshape(-1)[some]
     form = place_of(effect)
     if form is None:
         nothing = np.zeros((0, _PLACES))
         return Evidence(effect.name, "error", effect.drawn_against, at, done, nothing, nothing, nothing)
-    places, told, std = _told(look, form, value, does, kept, _directions(effect, look.motion))
+    # The effect acts at samples without valid outputs as well.
+    signs = np.where(known, _directions(effect, look.motion), np.nan)
+    places, told, std = _told(look, form, value, does, kept, signs)
     return Evidence(effect.name, "torque", effect.drawn_against, at, done, places, told, std)
 
 
@@ -125,18 +129,19 @@ def _told(
     kept: np.ndarray,
     direction: Float[np.ndarray, "segments knots"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least-squares estimate of the torque as a piecewise linear function with nodes at `places`, for each direction,
-    with all parameters as fitted."""
+    """Least-squares estimate of the torque as a piecewise linear function with nodes at `places`, for each direction
+    (NaN where it is unknown), with all parameters as fitted."""
     signs = np.unique(direction[kept])
     places, hats, middle = [], [], []
     for sign in signs:
-        there = kept & (direction == sign)
+        acting = direction == sign
+        there = kept & acting
         nodes = np.unique(np.quantile(value[there], np.linspace(0.01, 0.99, _PLACES)))
         nodes = np.pad(nodes, (0, _PLACES - nodes.size), constant_values=np.nan)
         places.append(nodes)
         middle.append(_nearby(value[there], does[there], nodes))
-        hats.append(_hats(value, nodes) * there[..., None])
-    found = products(look, Acting((look.pushes[form.name],)), (np.concatenate(hats, axis=-1),))
+        hats.append(np.where(acting[..., None], _hats(value, nodes), 0.0))
+    found = products(look, look.acting(form.name), (np.concatenate(hats, axis=-1),))
     own = slice(len(look.problem.free.paths), None)
     # The error is whitened: the plain sum over outputs is the likelihood.
     gram = np.einsum("siipq->pq", found.gram[..., own, own])

@@ -131,7 +131,8 @@ def search_effects(
         dropped += superfluous
         kept, compared = ([r for r in some if r.winner.name not in superfluous] for some in (kept, compared))
     for name in (this.winner.name for this in kept if this.winner.name not in without):
-        without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
+        alone = len(kept) == 1 and current.hold == base.hold
+        without[name] = base if alone else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise, tuple(compared), limited)
 
 

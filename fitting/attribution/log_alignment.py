@@ -1,7 +1,7 @@
 """Time offsets of several logs from a spectral line of the residual. A disturbance of constant frequency that is
 independent of the logs starts each one in another phase."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -11,11 +11,11 @@ from jaxtyping import Complex, Float
 from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.rules import RULES
 from fitting.attribution.study import Data, Study
-from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.estimate import Fit, log_of, segments_by
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import effect_paths
 from fitting.estimation.projection import solved
-from fitting.first_order.gains import Acting, LinearisedFit, best_steps, left_after, linearise_along, products
+from fitting.first_order.gains import LinearisedFit, best_steps, left_after, linearise_along, products
 from fitting.first_order.motion import place_of
 from fitting.first_order.spectral_lines import spectral_lines
 from hdjax import Hold
@@ -95,7 +95,7 @@ def with_clocks_set(base: Trial, study: Study) -> tuple[Trial, Study]:
         base: the base model.
         study: the data and their segmentation.
     """
-    if len(study.data[base.hold][0]) < 2:
+    if len({log_of(stretch) for stretch in study.data[base.hold][0]}) < 2:
         return base, study
     seen = max(_lines(base.training), key=lambda line: line.share, default=None)
     if seen is None or seen.share < RULES.line_share or np.sum(seen.told > RULES.line_errors) < 2:
@@ -118,8 +118,8 @@ def with_clock_shifts(
     late: Sequence[float], tests: dict[Hold, tuple[Stretch, ...]], fitted: Sequence[Stretch]
 ) -> dict[Hold, tuple[Stretch, ...]]:
     """Test stretches with the time offsets of the logs that they belong to."""
-    by_log = {s.experiment.log: by for s, by in zip(fitted, late, strict=True)}
-    return {h: tuple(_put_back(s, by_log.get(s.experiment.log, 0.0)) for s in some) for h, some in tests.items()}
+    by_log = {log_of(s): by for s, by in zip(fitted, late, strict=True)}
+    return {h: tuple(_put_back(s, by_log.get(log_of(s), 0.0)) for s in some) for h, some in tests.items()}
 
 
 def _put_back(stretch: Stretch, by: float) -> Stretch:
@@ -131,7 +131,8 @@ def _set_by(seen: Phasors, base: Trial, study: Study) -> Study | None:
     """The data with clocks aligned by a line, refined by refits with it; None where these do not improve the fit."""
     near = base
     for _ in range(_REFITS):
-        study = replace(study, data=_with_clocks_put_back(study.data, seen.late))
+        late = dict(zip(segments_by(near.training, log_of), seen.late.tolist(), strict=True))
+        study = replace(study, data=_with_clocks_put_back(study.data, late))
         near = attempt(base.model.with_effects(seen.in_phase.effect), study, base.hold, start=near)
         if not near.training.objective < base.training.objective - RULES.least_gain:
             return None
@@ -141,9 +142,9 @@ def _set_by(seen: Phasors, base: Trial, study: Study) -> Study | None:
     return study
 
 
-def _with_clocks_put_back(data: Data, late: Float[np.ndarray, " logs"]) -> Data:
+def _with_clocks_put_back(data: Data, late: Mapping[str, float]) -> Data:
     def each(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-        return tuple(_put_back(s, by) for s, by in zip(stretches, late, strict=True))
+        return tuple(_put_back(s, late[log_of(s)]) for s in stretches)
 
     return {hold: (each(training), each(selection)) for hold, (training, selection) in data.items()}
 
@@ -172,7 +173,7 @@ def _at(place: type[LearnedTorque], omega: float, look: LinearisedFit, found: Fi
     `own`."""
     angle = omega * np.asarray(look.conditions.time)
     size = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    by_log = products(look, Acting((look.pushes[place.name],)), (size,)).added(segments_of_logs(found))
+    by_log = products(look, look.acting(place.name), (size,)).added(np.stack([*segments_by(found, log_of).values()]))
     kept = by_log.columns([*(i for i, path in enumerate(found.free.paths) if path not in own), -2, -1])
     steps = best_steps(kept)
     weight = np.linalg.pinv(left_after(kept, steps) / np.maximum(kept.samples, 1.0)[:, None, None], hermitian=True)

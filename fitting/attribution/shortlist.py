@@ -75,7 +75,7 @@ def _simplest(leads: Sequence[Lead]) -> Lead:
     def order(lead: Lead) -> tuple[int, int, int]:
         behind = round((best.gain - lead.gain) / (_THE_SAME * best.gain))
         own = len(effect_paths(lead.effect)) + len(lead.effect.states)
-        return own, behind, CATALOGUE.index(type(lead.effect))
+        return own, behind, CATALOGUE.index(type(lead.effect)) if type(lead.effect) in CATALOGUE else len(CATALOGUE)
 
     return min(leads, key=order)
 

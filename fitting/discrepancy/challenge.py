@@ -1,7 +1,8 @@
 """Check of named effects by learned terms: where a residual remains, one is learned beside them and one in their
 place."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -24,9 +25,10 @@ from fitting.attribution.support import (
 from fitting.discrepancy.learn import Unknown, learn_supported, share_of
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import half_log_determinant
-from fitting.estimation.free_run import FreeRun, free_run, rms_error
+from fitting.estimation.free_run import rms_error
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
+from fitting.validation.account import free_runs
 
 
 class Challenge(eqx.Module):
@@ -59,6 +61,18 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         noise: of the measured outputs, where it was estimated.
     """
 
+    @functools.cache
+    def in_place() -> Unknown | None:
+        return _learned(Standing(base, base, noise), study)
+
+    return _challenged(base, named, study, noise, in_place)
+
+
+def _challenged(
+    base: Trial, named: Trial, study: Study, noise: MeasurementNoise, in_place: Callable[[], Unknown | None]
+) -> Challenge:
+    """[`challenge_names`][] with a function that learns a term in place of all names."""
+
     def seen_as(trial: Trial) -> ModelEvidence:
         return model_evidence(trial, noise)
 
@@ -73,7 +87,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
         seen = replace(seen, left=noise_evidence(left))
     while (question := next_question(seen)) is not None:
         if question == "instead":
-            instead = _learned(Standing(base, base, noise), study)
+            instead = in_place()
             if instead is None:
                 seen = seen.answered("instead", None)
                 continue
@@ -83,7 +97,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
             if beside is not None:
                 completed = _without_learned(base, named, beside, study)
                 if completed is not None:
-                    return challenge_names(base, completed, study, noise=noise)
+                    return _challenged(base, completed, study, noise, in_place)
                 named, beside = _without_superfluous(base, named, beside, study)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
@@ -191,18 +205,9 @@ def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Stud
 def _long_errors(trials: Sequence[Trial], study: Study) -> list[float] | None:
     """Rms errors of free runs along whole held-out stretches, infinite where one diverges. None where none of them
     follows the drive for long, as where its motion is chaotic."""
-    runs = [_free_runs(trial, study) for trial in trials]
+    runs = [
+        free_runs(t.training, study.data[t.hold][1], noise=t.training.covariance, halo=study.setting.halo)
+        for t in trials
+    ]
     errors, moves = [rms_error(own) for own in runs], float(np.std(np.concatenate([r.measured for r in runs[0]])))
     return errors if min(errors) <= 0.5 * moves else None
-
-
-def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
-    """Free runs of the held-out stretches."""
-    return free_run(
-        trial.model,
-        study.data[trial.hold][1],
-        covariance=trial.training.covariance,
-        halo=study.setting.halo,
-        substeps=trial.training.substeps,
-        like=trial.held_out,
-    )

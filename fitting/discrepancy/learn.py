@@ -99,17 +99,19 @@ def learn(before: Trial, study: Study) -> Unknown | None:
     best = _likeliest(alone, None, before, study)
     memory: MemoryScreen | None = None
     remembered: tuple[MemoryCandidate, Trial] | None = None
+    refitted = False
     if not (faint or _is_enough(best)):
         memory = screen_memory(before, seen, study, least=least)
         # A law with memory has fewer parameters than a function of two variables.
-        if memory.candidates and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0):
+        refitted = bool(memory.candidates) and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0)
+        if refitted:
             remembered = memory.put_inside(before, study, rival=best)
     if not _is_enough(remembered):
         if not _is_enough(best):
             worth = [c for c in pairs if best is None or c.gain >= best[0].gain + RULES.variable]
             best = _likeliest(worth, best, before, study)
         best = None if best is None else _refined(best, study)
-        if memory is not None and remembered is None and not _is_enough(best):
+        if memory is not None and not refitted and not _is_enough(best):
             remembered = memory.put_inside(before, study, rival=best)
 
     if remembered is not None and (best is None or _betters(remembered[1], best[1], before)):

@@ -27,6 +27,7 @@ from fitting.first_order.gains import (
 )
 from fitting.first_order.motion import ERROR, SLOPE, place_of, unit_reading
 from fitting.first_order.spectral_lines import spectral_lines
+from fitting.uncertainty.innovations import spread_evenly
 from hdjax import Model, ReducedModel
 from hdjax.effects.learned import (
     LEARNED,
@@ -106,14 +107,13 @@ class SearchContext(eqx.Module):
     def instants(self) -> Int[np.ndarray, " instants"]:
         """Evenly spaced valid knots, which sample the density of the data."""
         kept = np.flatnonzero(self.weight.reshape(-1) > 0)
-        return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
+        return kept[spread_evenly(kept.size, _INSTANTS)]
 
     def acting(self, form: type[Learned]) -> Acting:
         """Influence of a unit of a form's function, and of its slope for an error of the mesh."""
         if issubclass(form, LearnedReading):
-            return Acting(reading=unit_reading(self.look.model, form))
-        names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
-        return Acting(tuple(self.look.pushes[name] for name in names))
+            return Acting(readings=(unit_reading(self.look.model, form),))
+        return self.look.acting(*((form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)))
 
     def torque_push(self, place: type[LearnedTorque] | None) -> Float[np.ndarray, "segments knots states"]:
         """Change of the state's rates by a unit of torque at a place; in the mesh for an error of an angle."""

@@ -227,7 +227,7 @@ def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) 
     """The base model with its parameters fixed at estimates from one side's equation, or from a fit beside friction."""
     told = model.replace({path: driven.model.get(path) for path in MESH})
     horizon = short_horizon(told, training)
-    segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
+    segmentation = Segmentation(horizon, None, halo, suggested_substeps(told, training))
     return _fitted(told, training=training, segmentation=segmentation, strategy=Strategy(hold_parameters=True))
 
 

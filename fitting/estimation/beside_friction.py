@@ -12,7 +12,7 @@ from fitting.estimation.driven_load import friction_from_motor
 from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import fitted_paths
-from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
+from fitting.estimation.problem import Segmentation, short_horizon, suggested_substeps
 from fitting.estimation.scales import largest_torque, scales
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import MotorFriction
@@ -38,7 +38,7 @@ def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: i
 
     def fitted(model: Model, like: Sequence[Model], strategy: Strategy = Strategy()) -> Fit:
         substeps = max(suggested_substeps(m, training) for m in like)
-        segmentation = Segmentation(horizon, segment_length(horizon), halo, substeps)
+        segmentation = Segmentation(horizon, None, halo, substeps)
         return _fitted(model, strategy, training=training, segmentation=segmentation)
 
     rubbing = [(fitted(beside_friction(s, training), starts, Strategy(_TRIAL_STEPS)), s) for s in starts]

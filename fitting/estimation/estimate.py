@@ -1,8 +1,9 @@
 """Least-squares fit of parameters, initial states and noise covariance to segments of logs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -34,6 +35,9 @@ _OUTLIER = 6.0
 _MOST_MOVES = 4
 # Iterations in each of the growing windows of samples.
 _WINDOW_STEPS = 12
+
+
+Label = TypeVar("Label", bound=Hashable)
 
 
 class Start(eqx.Module):
@@ -355,10 +359,19 @@ def half_log_determinant(covariance: Array | np.ndarray) -> float:
     return float(0.5 * value) if sign > 0 and np.isfinite(value) else np.inf
 
 
-def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
-    """The segments of a fit that belong to each of its stretches."""
-    ends, place = np.cumsum(found.pieces)[:, None], np.arange(len(found.error))
-    return (ends - found.pieces[:, None] <= place) & (place < ends)
+def segments_by(found: Fit, label: Callable[[Stretch], Label]) -> dict[Label, Bool[np.ndarray, " segments"]]:
+    """The segments of a fit whose stretches share a label, such as their log, in the order of first stretches."""
+    ends, place = np.cumsum(found.pieces), np.arange(len(found.error))
+    by_label: dict[Label, Bool[np.ndarray, " segments"]] = {}
+    for stretch, end, count in zip(found.stretches, ends, found.pieces, strict=True):
+        own, key = (end - count <= place) & (place < end), label(stretch)
+        by_label[key] = own | by_label[key] if key in by_label else own
+    return by_label
+
+
+def log_of(stretch: Stretch) -> str:
+    """Name of the log that a stretch between gaps belongs to."""
+    return stretch.experiment.log
 
 
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:

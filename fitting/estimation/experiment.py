@@ -20,6 +20,8 @@ from hdjax.dynamics import BOTH_ANGLES
 # Both assumed: largest step over the usual one, beyond which samples are inserted; most samples inserted per row.
 _LONGEST_STEP = 1.5
 _MOST_PUT_IN = 10
+# Distance of stamps that differ by rounding, in typical steps.
+_ROUNDING = 1e-3
 
 
 class Moved(NamedTuple):
@@ -164,6 +166,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None, stated:
     known = np.ones(len(log), dtype=bool) if log.input_known is None else log.input_known.copy()
     known[[0, -1]] = True
     stamps, samples = bridged(log.time[known], log.input[known])
+    stamps = _at_rows(stamps, log.time)
     time, rows = _grid(log, stamps)
     torque = _on_grid(sampled(stamps, samples, hold=hold), time)
     # Commands of a digital drive are held between samples; measured torques are continuous and interpolated linearly.
@@ -221,6 +224,13 @@ def _motor_angle(log: Log, time: np.ndarray, rows: np.ndarray) -> np.ndarray | N
 def _channel(log: Log, values: np.ndarray | None, time: np.ndarray, hold: Hold) -> PiecewisePolynomial | None:
     """A channel of the log on the grid; None where the log has none."""
     return None if values is None else _on_grid(sampled(log.time, values, hold=hold), time)
+
+
+def _at_rows(stamps: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Stamps of a bridged torque, those within rounding of a row's stamp equal to it."""
+    after = np.clip(np.searchsorted(time, stamps), 1, len(time) - 1)
+    nearest = time[np.where(stamps - time[after - 1] < time[after] - stamps, after - 1, after)]
+    return np.where(np.abs(stamps - nearest) < _ROUNDING * np.median(np.diff(time)), nearest, stamps)
 
 
 def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

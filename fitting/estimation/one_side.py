@@ -21,7 +21,7 @@ from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Experiment, Moved, Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
-from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
+from fitting.estimation.problem import Segmentation, short_horizon, suggested_substeps
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.starting_values import shaft_torques, start_beside_torques, starts_of_equation
 from hdjax import LoadDrivenModel, Model, MotorDrivenModel, OneSideModel, PiecewisePolynomial, TwoInertiaModel
@@ -162,7 +162,7 @@ def held_at(model: Model, found: Fit, paths: Sequence[str] | None = None) -> Fit
 
 
 def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
-    segmentation = Segmentation(horizon, segment_length(horizon), substeps=suggested_substeps(model, driven))
+    segmentation = Segmentation(horizon, substeps=suggested_substeps(model, driven))
     return fit(model, driven, base_paths(model), segmentation)
 
 

@@ -21,6 +21,8 @@ from hdjax.lanes import spread
 
 # Longest segment; longer simulations join several, which run in parallel.
 _LONGEST_SEGMENT = 256
+# Natural periods in a short simulation.
+_PERIODS = 6.0
 # Longest solver step in settling times of a bristle; above 2.8 it is unstable.
 _SETTLINGS = 2.0
 STEP_ANGLE = 0.15
@@ -75,7 +77,7 @@ def pose(
     segments, substeps = segmentation.of(stretches), segmentation.substeps
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    substeps = max(substeps, stable_substeps(model, stretches[0].experiment.time_step))
+    substeps = max(substeps, stable_substeps(model, max(s.experiment.time_step for s in stretches)))
     free = free_parameters(model, paths, typical_scales(model, stretches))
     if states is None:
         states = initial_states(model, segments)
@@ -213,7 +215,7 @@ def stable_substeps(model: Model, time_step: float) -> int:
     return max(1, int(np.ceil(steps - 1e-9)))
 
 
-def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:
-    """Samples in a segment of about `periods` natural periods, as a power of two (few shapes, few programs)."""
+def short_horizon(model: Model, stretches: Sequence[Stretch]) -> int:
+    """Samples in a segment of about six natural periods, as a power of two (few shapes, few programs)."""
     period = 2 * np.pi / natural_frequency(model, stretches) / stretches[0].experiment.time_step
-    return int(2 ** np.clip(np.round(np.log2(periods * period)), 5, 11))
+    return int(2 ** np.clip(np.round(np.log2(_PERIODS * period)), 5, 11))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.estimation.base_fit import leaves_white_noise
-from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.estimate import Fit, segments_by
 from fitting.estimation.experiment import Experiment
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from hdjax import Hold
@@ -34,11 +34,10 @@ def recalibrated(found: Fit, *data: Data) -> list[dict[Hold, tuple[Experiment, .
 def remaining_offsets(found: Fit) -> dict[float, float]:
     """Mean residual of the dynamic error in the logs with each estimated zero; none where it is insignificant, or more
     is left than constants and white noise: then `encoder_offset` is one of several candidates."""
-    zeros = [stretch.experiment.zero for stretch in found.stretches]
     error, weight = np.asarray(found.error).copy(), np.asarray(found.problem.segments.weight) > 0
-    segments, means = segments_of_logs(found), {}
-    for zero in set(zeros):
-        known = np.any(segments[[z == zero for z in zeros]], axis=0)[:, None] & weight
+    means = {}
+    for zero, own in segments_by(found, lambda stretch: stretch.experiment.zero).items():
+        known = own[:, None] & weight
         left = error[known, -1]
         error[known, -1] -= left.mean()
         if zero != 0.0 and abs(left.mean()) > _SEEN * left.std() / np.sqrt(left.size):

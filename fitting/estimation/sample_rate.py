@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.estimate import Fit, log_of, segments_by
 from fitting.estimation.experiment import Experiment
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import Problem
@@ -59,10 +59,8 @@ def rate_columns(found: Fit) -> RateColumns | None:
         (np.asarray(a) - np.asarray(b)) / (2.0 * _CHANGE)
         for a, b in ((longer.residual, shorter.residual), (longer.gap, shorter.gap))
     )
-    own = segments_of_logs(found)
-    of_log = np.stack(
-        [np.any(own[[s.experiment.log == log for s in found.stretches]], axis=0) for log in open_logs], axis=-1
-    )
+    own = segments_by(found, log_of)
+    of_log = np.stack([own[log] for log in open_logs], axis=-1)
     # A gap is a segment's initial state minus the preceding segment's final state.
     columns = states.without(change[:, :, None] * of_log[:, None], -gap[:, :, None] * of_log[:, None])
     return RateColumns(
@@ -86,8 +84,10 @@ def refined_intervals(found: Fit) -> dict[str, float]:
     columns = np.concatenate([seen.parameters, seen.columns], axis=2)
     columns = columns.reshape(-1, columns.shape[2])
     count = len(seen.logs)
-    prior = np.diag(np.concatenate([np.zeros(columns.shape[1] - count), 1.0 / seen.std**2]))
+    precision, off = np.asarray(found.free.precision), np.asarray(found.free.off_prior(found.free.pack(found.model)))
+    prior = np.diag(np.concatenate([precision**2, 1.0 / seen.std**2]))
     information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
+    slope[: precision.size] += precision * off
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True)
     step = -scale * (inverse @ (scale * slope))

@@ -34,26 +34,33 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
         stretches: the data.
         model: supplies the natural frequency and the reduction ratio, and the twist where that was not measured.
     """
-    x = np.concatenate([twist(s, model) for s in stretches])
+    twists = [twist(s, model) for s in stretches]
+    x = np.concatenate(twists)
     x = x - np.median(x)
-    step = stretches[0].experiment.time_step
-    angles = [s.experiment.motor_angle[s.start : s.stop] for s in stretches if s.experiment.motor_angle is not None]
-    motor = float(np.sqrt(np.mean([_rate(a, step) ** 2 for a in angles]))) if angles else 1.0
-    output = [_speed(s, model, step) for s in stretches]
+    steps = [s.experiment.time_step for s in stretches]
+    angles = [
+        (s.experiment.motor_angle[s.start : s.stop], step)
+        for s, step in zip(stretches, steps, strict=True)
+        if s.experiment.motor_angle is not None
+    ]
     temperature, change = _temperature(stretches)
     return Scales(
         x=float(np.std(x)),
         x_max=float(np.max(np.abs(x))),
-        v=_rate(x, step),
-        omega_m=motor,
-        omega_l=float(np.sqrt(np.mean(np.square(output)))),
-        time_step=step,
+        v=_rms([_rate(*pair) for pair in zip(twists, steps, strict=True)]),
+        omega_m=_rms([_rate(*pair) for pair in angles]) if angles else 1.0,
+        omega_l=_rms([_speed(s, model, step) for s, step in zip(stretches, steps, strict=True)]),
+        time_step=steps[0],
         duration=max(float(np.ptp(s.experiment.time)) for s in stretches),
         reduction_ratio=float(model.drive.N) if isinstance(model, TwoInertiaModel) else 1.0,
         omega_0=None if model is None else float(model.drive.omega_0),
         temperature=temperature,
         temperature_change=change,
     )
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _rate(values: np.ndarray, step: float) -> float:

@@ -29,21 +29,21 @@ def parted(
         zeros: of the twist, in other logs of the drive.
 
     Returns:
-        Both parts masked, with the zero offsets of the first; no test part where it would be too short to estimate an
-        error.
+        Both parts masked, with the zero offsets of the first. The whole log without a test part, where one of them
+        would have no stretch to fit, or the test part would be too short to estimate an error.
     """
     border = len(log) - round(share * len(log))
-    if share <= 0.0 or len(log) - border < _FEWEST:
-        return zeroed(masked(log), drive_file, zeros=zeros), None
-    known = zeroed(masked(log.rows(0, border)), drive_file, zeros=zeros)
-    end = log.rows(border, len(log))
-    if end.pieces == ():
-        return known, None
-    try:
-        end = masked(end)
-    except DataError:
-        return known, None
-    return known, counted_from(end, known.zero)
+    if share > 0.0 and len(log) - border >= _FEWEST:
+        known, end = log.rows(0, border), log.rows(border, len(log))
+        try:
+            end = masked(end)
+        except DataError:
+            pass
+        else:
+            if known.pieces != () and end.pieces != ():
+                known = zeroed(masked(known), drive_file, zeros=zeros)
+                return known, counted_from(end, known.zero)
+    return zeroed(masked(log), drive_file, zeros=zeros), None
 
 
 def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:

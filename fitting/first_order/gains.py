@@ -20,6 +20,7 @@ from fitting.first_order.motion import (
     conditions_at_knots,
     motions,
     unit_pushes,
+    unit_readings,
 )
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
@@ -43,6 +44,7 @@ class LinearisedFit(eqx.Module):
         motion: at each knot.
         conditions: time and temperature at each knot.
         pushes: change of the state's rates by a unit of each effect place, by its name.
+        readings: change of the outputs at the samples likewise; none where all outputs depend on the state alone.
         error: whitened output error.
     """
 
@@ -52,6 +54,7 @@ class LinearisedFit(eqx.Module):
     motion: Motion
     conditions: Conditions
     pushes: dict[str, Float[np.ndarray, "segments knots states"]]
+    readings: dict[str, Float[np.ndarray, "segments samples outputs"]]
     error: Float[np.ndarray, "segments samples outputs"]
 
     @property
@@ -59,17 +62,22 @@ class LinearisedFit(eqx.Module):
         """The fitted model."""
         return self.problem.model
 
+    def acting(self, *names: str) -> "Acting":
+        """Influence of a unit at each of some effect places."""
+        pushes, readings = (tuple(by[n] for n in names if n in by) for by in (self.pushes, self.readings))
+        return Acting(pushes, readings)
+
 
 class Acting(eqx.Module):
     """Influence of a unit of each part of a force.
 
     Attributes:
-        pushes: on the state's rates.
-        reading: on the outputs instead, for an encoder error.
+        pushes: on the state's rates; none of an encoder error.
+        readings: on the outputs at the samples; none where these depend on the state alone.
     """
 
     pushes: tuple[Float[np.ndarray, "segments knots states"], ...] = ()
-    reading: Float[np.ndarray, " outputs"] | None = None
+    readings: tuple[Float[np.ndarray, "*#samples outputs"], ...] = ()
 
 
 class Products(eqx.Module):
@@ -129,6 +137,7 @@ def linearise_along(fit: Fit) -> LinearisedFit:
         motions(fit.model, followed.states, conditions),
         conditions,
         unit_pushes(fit.model, followed.states, conditions),
+        unit_readings(fit.model, followed.states[:, :-1], segments),
         error,
     )
 
@@ -186,17 +195,18 @@ def _columns(
     look: LinearisedFit, acting: Acting, sizes: Sizes
 ) -> Float[np.ndarray, "segments samples outputs columns"]:
     """Derivatives of the whitened outputs by the free parameters and by each force."""
-    followed = look.followed
-    if acting.reading is not None:
-        reading = acting.reading[:, None] * sizes[0][:, :-1, None, :]
-        return np.concatenate([look.answers.parameters, look.answers.to(None, reading)], axis=-1)
-    lands: list[np.ndarray] = []
-    parts: list[np.ndarray] = []
-    for push, size in zip(acting.pushes, sizes, strict=True):
-        lands += [followed.from_start @ push[:, :-1, :, None], followed.from_end @ push[:, 1:, :, None]]
-        parts += [size[:, :-1], size[:, 1:]]
-    forces = Forces(np.concatenate(lands, axis=-1), np.stack(parts, axis=2))
-    return np.concatenate([look.answers.parameters, look.answers.to(forces)], axis=-1)
+    followed, forces, reading = look.followed, None, None
+    if acting.readings:
+        both = zip(acting.readings, sizes, strict=True)
+        reading = np.sum([reads[..., None] * size[:, :-1, None, :] for reads, size in both], axis=0)
+    if acting.pushes:
+        lands: list[np.ndarray] = []
+        parts: list[np.ndarray] = []
+        for push, size in zip(acting.pushes, sizes, strict=True):
+            lands += [followed.from_start @ push[:, :-1, :, None], followed.from_end @ push[:, 1:, :, None]]
+            parts += [size[:, :-1], size[:, 1:]]
+        forces = Forces(np.concatenate(lands, axis=-1), np.stack(parts, axis=2))
+    return np.concatenate([look.answers.parameters, look.answers.to(forces, reading)], axis=-1)
 
 
 def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:

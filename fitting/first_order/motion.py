@@ -14,6 +14,7 @@ from fitting.estimation.linear_response import NODES, WEIGHTS, Followed, acting,
 from fitting.estimation.machine_code import actuated
 from fitting.estimation.segments import Segments
 from hdjax import Model, TwoInertiaModel
+from hdjax.dynamics import JOINT_TORQUE, Inputs
 from hdjax.effects import (
     ActuatorEffect,
     Conditions,
@@ -147,11 +148,27 @@ def unit_pushes(
     """Change of the state's rates, at each of many states, by a unit of each quantity that effects add. These are a
     torque at each place of [`hdjax.effects.learned`][], by the name of the learned torque there, the incoming torque,
     an error of the mesh, and its slope."""
-    whole = isinstance(model, TwoInertiaModel)
-    names = [f.name for f in _torques(model)] + [ERROR, SLOPE] * whole + [INPUT]
-    axes = states.ndim - 1
+    names, axes = _names(model), states.ndim - 1
     found = slopes_at_instants(_rates, (np.zeros(len(names)), 0), (model, 0), (states, axes), (conditions, axes))
     return {name: found[..., i] for i, name in enumerate(names)}
+
+
+def unit_readings(
+    model: Model, states: Float[Array | np.ndarray, "segments samples states"], segments: Segments
+) -> dict[str, Float[np.ndarray, "segments samples outputs"]]:
+    """Change of the outputs at the samples by the same units. None without a sensor of the joint torque, which
+    measures a torque in the mesh directly."""
+    if JOINT_TORQUE not in model.measured:
+        return {}
+    inputs = inputs_at(model, segments, np.zeros_like(segments.width))
+    names = _names(model)
+    found = slopes_at_instants(_outputs, (np.zeros(len(names)), 0), (model, 0), (states, 2), (inputs, 2))
+    return {name: found[..., i] for i, name in enumerate(names)}
+
+
+def _names(model: Model) -> list[str]:
+    """Names of the quantities in the order of [`_probed`][]'s strengths."""
+    return [f.name for f in _torques(model)] + [ERROR, SLOPE] * isinstance(model, TwoInertiaModel) + [INPUT]
 
 
 def _torques(model: Model) -> list[type[LearnedTorque]]:
@@ -160,13 +177,22 @@ def _torques(model: Model) -> list[type[LearnedTorque]]:
 
 def _rates(strengths: Array, model: Model, state: Array, conditions: Conditions) -> Array:
     """The state's rates with each quantity at its strength; the last one is the torque."""
+    return _probed(strengths, model).rates(state, strengths[-1], jnp.zeros_like(strengths[-1]), conditions)
+
+
+def _outputs(strengths: Array, model: Model, state: Array, inputs: Inputs) -> Array:
+    """The outputs with each quantity at its strength."""
+    return _probed(strengths, model).outputs(state, replace(inputs, torque=inputs.torque + strengths[-1]))
+
+
+def _probed(strengths: Array, model: Model) -> Model:
+    """The model with the quantities other than the torque at their strengths."""
     # Added, not set by name: the model may have a learned term already.
     forms = zip(_torques(model), strengths, strict=False)
     torques = [form(axes=(), mixing=jnp.ones((1, 1)), c=(strength,)) for form, strength in forms]
     whole = isinstance(model, TwoInertiaModel)
     geometry = [_UnitGeometry(e=strengths[-3], e_slope=strengths[-2])] if whole else []
-    probed = model.with_effects(*torques, *geometry)
-    return probed.rates(state, strengths[-1], jnp.zeros_like(strengths[-1]), conditions)
+    return model.with_effects(*torques, *geometry)
 
 
 def carried(

@@ -3,8 +3,10 @@
 import numpy as np
 from jaxtyping import Float
 
-from fitting.estimation.estimate import Fit
+from fitting.estimation.estimate import Fit, lost
 
+# Largest number of lines.
+_MOST = 3
 # Neighbouring frequencies of the median that a line must exceed.
 _NEIGHBOURS = 41
 # Least distance of two lines, in frequencies: the width of a line under the window.
@@ -14,7 +16,7 @@ STANDS_OUT = 15.0
 """Least power of a line over the median of its surroundings."""
 
 
-def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
+def spectral_lines(fit: Fit) -> tuple[float, ...]:
     """Frequencies [rad/s] of the strongest lines in the residual, strongest first.
 
     The periodogram of the longest stretch's whitened residual (Hann window), summed over the outputs and divided by the
@@ -22,10 +24,10 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
 
     Args:
         fit: a fit.
-        most: largest number of lines.
     """
-    # Invalid samples of the longest stretch are zero.
-    pairs = zip(fit.stretches, fit.by_stretch(fit.white_error), strict=True)
+    # Invalid samples of the longest stretch are zero, and segments in which the simulation diverges.
+    white = np.where(lost(fit)[:, None, None], 0.0, fit.white_error)
+    pairs = zip(fit.stretches, fit.by_stretch(white), strict=True)
     stretch, series = max(reversed([*pairs]), key=lambda pair: len(pair[1]))
     count = series.shape[0]
     if count < 4 * _NEIGHBOURS:
@@ -38,8 +40,8 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     # The lowest frequencies are drift, not lines: fewer than two periods in the log.
     ratio[:4] = 0.0
     peaks = _peaks(ratio)
-    strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
-    step = float(np.median(np.diff(stretch.experiment.time)))
+    strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:_MOST]]
+    step = stretch.experiment.time_step
     return tuple((2.0 * np.pi * ((strongest + off_the_grid(power, strongest)) / (2 * count * step))).tolist())
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from fitting.estimation.estimate import Fit
+from fitting.estimation.estimate import Fit, lost
 from fitting.estimation.projection import solved
 from fitting.first_order.spectral_lines import without_lines
 from fitting.record import Record
@@ -37,9 +37,9 @@ class Surrogates(eqx.Module):
 
     @classmethod
     def of(cls, fit: Fit, seed: int) -> "Surrogates":
-        """Surrogates of a fit's whitened residual, in its segments with data."""
+        """Surrogates of a fit's whitened residual, in its segments with data that do not diverge."""
         random = np.random.default_rng(seed)
-        weight = np.asarray(fit.problem.segments.weight) > 0
+        weight = _used(fit)
         spectrum, length = _noise_spectrum(fit.white_error[weight].T)
         turns = np.stack([_turn(random, spectrum) for _ in range(DRAWS)])
         return cls(spectrum, turns, length, weight[: fit.pieces.sum()])
@@ -53,11 +53,8 @@ class Surrogates(eqx.Module):
         series = columns[self.counts]
         series, further = series[: self.length], series[self.length :]
         series[: len(further)] += further
-        # Each frequency also represents its negative, except for the last one of an even number of samples.
-        twice = np.full((self.turns.shape[1], 1), 2.0)
-        twice[-1] -= self.length % 2 == 0
         found: Any = rfft(series, axis=0, overwrite_x=True, workers=-1)
-        across = twice / self.length * np.einsum("of,foc->fc", self.spectrum, found.conj())
+        across = _represented(self.length)[:, None] / self.length * np.einsum("of,foc->fc", self.spectrum, found.conj())
         return np.real(self.turns @ across).T
 
 
@@ -73,16 +70,28 @@ def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
         seed: of the draws.
     """
     random = np.random.default_rng(seed)
-    weight = np.asarray(before.problem.segments.weight) > 0
+    weight = _used(before) & _used(after)
     changed = (np.asarray(before.error) - np.asarray(after.error)) @ np.asarray(before.problem.whitening).T
     spectrum, length = _noise_spectrum(before.white_error[weight].T)
     series = changed[weight].T
-    # Each frequency also represents its negative.
-    against = 2.0 / length * np.sum(np.fft.rfft(series[:, :length]).conj() * spectrum, axis=0)
+    against = _represented(length) / length * np.sum(np.fft.rfft(series[:, :length]).conj() * spectrum, axis=0)
     draws = DRAWS * PARTNERS
     explained = np.array([float(np.real(against @ _turn(random, spectrum))) for _ in range(draws)])
     null = (explained - 0.5 * np.sum(series**2)) / weight.sum()
     return (1 + int(np.sum(null >= before.objective - after.objective))) / (1 + draws)
+
+
+def _used(fit: Fit) -> Bool[np.ndarray, "segments samples"]:
+    """Valid samples of the segments in which the simulation does not diverge."""
+    return (np.asarray(fit.problem.segments.weight) > 0) & ~lost(fit)[:, None]
+
+
+def _represented(length: int) -> Float[np.ndarray, " frequencies"]:
+    """Number of frequencies that each one of a real series stands for: also its negative, except for zero, which is
+    left out of noise, and the last one of an even number of samples."""
+    twice = np.full(length // 2 + 1, 2.0)
+    twice[-1] -= length % 2 == 0
+    return twice
 
 
 def _noise_spectrum(series: Float[np.ndarray, "outputs n"]) -> tuple[Complex[np.ndarray, "outputs frequencies"], int]:

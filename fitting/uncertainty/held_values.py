@@ -55,8 +55,9 @@ def held_values(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
     held = tuple(p for p in _HELD if p in known and p not in free)
     if not held:
         return ()
-    products = np.asarray(_products(fit, held))
     count = len(fit.free.paths)
+    products = np.asarray(_products(fit, held))
+    products[:count, :count] += np.diag(np.asarray(fit.free.precision) ** 2)
     information, coupling = products[:count, :count], products[:count, count:]
     # The optimum moves so that the gradient remains zero: (J^T J) dp + J^T dr/dJ dJ = 0.
     response = -np.linalg.lstsq(information, coupling, rcond=None)[0]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from scipy.special import expit
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.estimate import Fit, log_of, segments_by
 from fitting.estimation.linear_response import follow
 from fitting.estimation.problem import with_hidden_states
 from fitting.estimation.residual import RUNAWAY, Problem, Unknowns
@@ -209,7 +209,7 @@ def _steps(fit: Fit, residual: Float[np.ndarray, "outputs outputs"]) -> Steps:
     problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
     weight = np.asarray(problem.segments.weight)
-    logs = [np.flatnonzero(weight.any(axis=1) & own) for own in segments_of_logs(fit)]
+    logs = [np.flatnonzero(weight.any(axis=1) & own) for own in segments_by(fit, log_of).values()]
     logs = [own for own in logs if own.size]
     logs = [logs[i] for i in spread_evenly(len(logs), _LOGS)]
     logs = [own[spread_evenly(own.size, _SEGMENTS)] for own in logs]

@@ -97,14 +97,13 @@ def prediction_bands(
     whole = whole_simulations(fitted.model, fitted.free, stretches, halo, substeps)
     states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
     by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
-    white = np.asarray(whitening(noise))
     driven = np.zeros(by_parameter.shape[:2])
     if torque_noise > 0.0:
         driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
     samples = window(fitted.model, stretches)
     windows = [stretch.beginning(samples).weight for stretch in stretches]
     return tuple(
-        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance, weight)
+        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], noise, found.covariance, weight)
         for i, (run, n, weight) in enumerate(zip(runs, map(len, stretches), windows, strict=True))
     )
 
@@ -128,18 +127,17 @@ def _band(
     by_parameter: np.ndarray,
     by_state: np.ndarray,
     driven: np.ndarray,
-    white: np.ndarray,
+    noise: Float[Array, "outputs outputs"],
     covariance: np.ndarray,
     weight: np.ndarray,
 ) -> PredictionBand:
     """The band of one run, from the derivatives of its outputs, torque noise, and the weights of the samples in its
     initial-state window; NaN where they diverge."""
-    variance = np.linalg.inv(white)
-    std_noise = float(np.sqrt((variance @ variance.T)[-1, -1]))
+    std_noise = float(np.sqrt(noise[-1, -1]))
     if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
         unknown = np.full(len(by_parameter), np.nan)
         return PredictionBand(run, unknown, unknown, std_noise, driven)
-    own = white * weight[:, None, None]
+    own = np.asarray(whitening(noise)) * weight[:, None, None]
     seen = (own @ by_state[: weight.size]).reshape(-1, by_state.shape[2])
     moved = (own @ by_parameter[: weight.size]).reshape(-1, by_parameter.shape[2])
     # Scaled, since angles and rates differ by orders of magnitude; a hidden state that the window does not determine is

@@ -14,7 +14,7 @@ from fitting.attribution.log_alignment import Phasors, clock_shifts, with_clocks
 from fitting.attribution.study import Data, Setting, Study
 from fitting.estimation.base_fit import base_fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, split
-from fitting.first_order.gains import Acting, linearise_along, products
+from fitting.first_order.gains import linearise_along, products
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
 
@@ -129,6 +129,6 @@ def test_diverged_segment_is_excluded_from_the_line_estimate(fitted_to_phases):
     assert not weight[2].any() and weight[[1, 3]].all()
     time = np.asarray(look.conditions.time)
     size = np.stack([np.cos(OMEGA * time), np.sin(OMEGA * time)], axis=-1)
-    found = products(look, Acting((look.pushes[LearnedMeshTorque.name],)), (size,))
+    found = products(look, look.acting(LearnedMeshTorque.name), (size,))
     for part in vars(found).values():
         assert np.isfinite(part).all() and not part[2].any() and part[1].any()

@@ -185,7 +185,10 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "speeds into a file": (("speeds", "--out", "log.csv/below"), ("--out", "log.csv")),
     "negative damping": (("speeds", "--B_sp", "-0.1"), ("--B_sp", "-0.1")),
     "speeds of a reduced model": (("speeds", "--model", "reduced.json"), ("reduced.json", "two inertias")),
-    "speeds of an order that is not whole": (("speeds", "--model", "ripple.json"), ("ripple.json", "kinematic_harmonic")),
+    "speeds of a broken order": (
+        ("speeds", "--model", "ripple.json"),
+        ("ripple.json", "kinematic_harmonic"),
+    ),
     "speeds of a broken model": (("speeds", "--model", "broken.json"), ("broken.json",)),
     "speeds without a range": (("speeds", "--slowest", "500", "--fastest", "500"), ("--slowest", "--fastest")),
     "speed without end": (("speeds", "--fastest", "inf"), ("--fastest", "inf")),

@@ -68,7 +68,11 @@ def test_sweep_file_defines_model_forcing_and_points(tmp_path):
         ("alpha = 50.0", f"alpha = {'[' * 2000}", "not a TOML file"),
         ("alpha = 50.0", f"alpha = 1{'0' * 400}", r"\[drive\] alpha must be a number"),
         ('"steady"', '["steady"]', r"\[sweep\] response must be one of"),
-        ("k2 = 0.5", "k2 = 0.5\n[effects.dahl]\nyield_twist = -1e-4", r"\[effects.dahl\] yield_twist must lie within 0"),
+        (
+            "k2 = 0.5",
+            "k2 = 0.5\n[effects.dahl]\nyield_twist = -1e-4",
+            "yield_twist must lie within 0",
+        ),
     ],
 )
 def test_invalid_sweep_file_is_refused_in_one_sentence(tmp_path, old, new, words):

@@ -196,6 +196,28 @@ def test_missing_samples_are_interpolated_with_weight_zero():
     assert np.isfinite(np.asarray(segments.measured)).all()
 
 
+def test_unknown_torques_put_no_samples_beside_their_rows():
+    logged = replace(log(1000), motor_torque=np.sin(0.05 * np.arange(1000)))
+    known = np.ones(1000, dtype=bool)
+    known[[100, 101, 102, 500, 700, 701]] = False
+    found = experiment_from_log(replace(logged, input_known=known), hold="zero-order", N=rig.N)
+    np.testing.assert_array_equal(found.time, logged.time)
+    np.testing.assert_allclose(np.asarray(found.torque.coefficients)[:, 0], logged.motor_torque, atol=2e-5)
+
+
+def test_scales_of_logs_with_different_rates_are_those_of_each():
+    time = np.arange(4000) * rig.STEP
+    load = 0.3 * np.sin(3.0 * time)
+    motion = np.stack([rig.N * (load + 2e-3 * np.sin(40.0 * time)), load], axis=1)
+    slow = rig.drive_log(motion, np.zeros(time.size), noise=0.0)
+    quick = replace(slow, time=0.1 * slow.time)
+    both = [Stretch(experiment_from_log(one, hold="linear", N=rig.N), 0, 4000) for one in (slow, quick)]
+    alone, together = scales(both[:1]), scales(both)
+    for name in ("v", "omega_m", "omega_l"):
+        # The quick log is the slow one played ten times as fast.
+        assert getattr(together, name) == pytest.approx(getattr(alone, name) * np.sqrt((1 + 100) / 2), rel=1e-9)
+
+
 def test_log_without_gaps_is_unchanged_and_has_no_weights():
     plain = experiment()
     assert plain.weight is None and plain.rows is None

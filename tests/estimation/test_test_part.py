@@ -1,6 +1,7 @@
 """Test data are used by the final figures only."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,14 @@ def test_short_log_has_no_test_data(tmp_path: Path):
     short = read_log(path, drive_file).rows(0, 400)
     known, test = parted(short, drive_file)
     assert len(known) == 400 and test is None
+
+
+def test_log_whose_stretches_the_border_would_shorten_too_much_has_no_test_data(tmp_path: Path):
+    path, drive = write_logs(tmp_path, False)
+    drive_file = read_drive_file(drive)
+    whole = replace(read_log(path, drive_file).rows(0, 520), pieces=((250, 520),))
+    known, test = parted(whole, drive_file)
+    assert (len(known), known.pieces, test) == (520, ((250, 520),), None)
 
 
 def test_log_named_as_test_data_is_used_whole(tmp_path: Path):
