@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from fitting.blas import one_blas_thread
 from fitting.clock import Clock
 from fitting.estimation.base_fit import BaseFit, base_fit, is_held
 from fitting.estimation.estimate import Fit
@@ -24,6 +25,7 @@ from fitting.validation.residual_tests import residual_tests
 from hdjax import Hold, Model, OneSideModel, TwoInertiaModel
 
 
+@one_blas_thread
 def fit_only(
     model: Model,
     experiments: Mapping[Hold, tuple[Experiment, ...]],

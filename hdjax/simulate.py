@@ -142,9 +142,9 @@ def require_sampled(model: Model, forcing: Callable[[Array], Array]) -> None:
 
 
 def require_start(model: Model, times: Array, initial_state: Array) -> None:
-    """Refuse times that fall, and a state that is not one of the model."""
+    """Refuse times that do not rise, and a state that is not one of the model."""
     if times.ndim != 1 or times.size == 0 or not (isinstance(times, Tracer) or np.all(np.diff(times) >= 0.0)):
-        raise ValueError("`times` must not fall from the start of the simulation on, but do")
+        raise ValueError("`times` must rise from the start of the simulation on, but do not")
     if np.shape(initial_state) != (len(model.state_names),):
         names, shape = ", ".join(model.state_names), np.shape(initial_state)
         raise ValueError(f"`initial_state` must have a number for each of {names}, but has the shape {shape}")

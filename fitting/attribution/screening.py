@@ -5,7 +5,7 @@ its motion. Least squares with these regressors gives each effect's strength and
 also on held-out data. Applied to surrogates of the residual, it gives the null distribution of the best gain.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Generic
 
@@ -19,12 +19,12 @@ from fitting.estimation.free_parameters import MESH, strength_paths
 from fitting.estimation.scales import scales
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import (
-    Answered,
     FittedMotion,
+    Responses,
     along_measured_motion,
-    batches,
     fitted_motion,
     follow_on,
+    responses,
 )
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
@@ -53,6 +53,8 @@ class Lead(eqx.Module):
     own_states: Float[np.ndarray, "segments own"] | None = None
 
 
+# First-order estimates of a proposal, and the null distribution of its gain.
+Looked = tuple[Lead, Float[np.ndarray, " draws"]]
 # Type of a form's screening result, also of quasi-static logs.
 LeadT = TypeVar("LeadT", default=Lead)
 
@@ -100,31 +102,35 @@ def screen(
     # Fixed parameters stay fixed: their influence along a motion that deviates is not that along the true one.
     free_now = () if strays and training.was_held else training.free.paths
     skipped = len(training.free.paths) - len(free_now)
-    leads: dict[str, Lead] = {}
-    chance = np.full(DRAWS * PARTNERS, -np.inf)
     known = len(free_now)
     off, slope = _priors(training)
     free_mesh = np.where([path in MESH for path in training.free.paths], 0.0, slope)
-    for effect, own, states, (fitted, unseen) in _responses(training, held_out, proposals, seed, strays=strays):
-        used = [*range(known), *(skipped + known + c for c in own)]
-        fitted, unseen = fitted.columns(used), unseen.columns(used)
-        if known:
-            fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
-        if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
-            # Its response diverges along this motion: nothing is known to first order.
-            continue
-        columns = list(range(known, known + len(own)))
-        paths = strength_paths(effect)
-        info = model.with_effects(effect).parameters()
-        positive = [c for c, p in zip(columns, paths, strict=True) if info[p][1].positive]
-        step, gain = _linear_gain(fitted, unseen, known, positive)
-        chance = np.maximum(chance, null_gains(fitted, unseen, known))
-        if effect.name in leads and leads[effect.name].gain >= gain:
-            continue
-        strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
-        filled = model.with_effects(effect).replace(strengths).effect(effect.name)
-        changes = {p: step[i] for i, p in enumerate(free_now)}
-        leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
+
+    def looked_at(found: Responses) -> Iterator[tuple[Lead, np.ndarray]]:
+        """First-order estimates of proposals, and null distributions of their gains."""
+        for effect, own, states in zip(found.proposals, found.columns, found.own_states, strict=True):
+            used = [*range(known), *(skipped + known + c for c in own)]
+            fitted, unseen = (scores.columns(used) for scores in found.scores)
+            if known:
+                fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
+            if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
+                # Its response diverges along this motion: nothing is known to first order.
+                continue
+            paths, info = strength_paths(effect), model.with_effects(effect).parameters()
+            positive = [known + i for i, p in enumerate(paths) if info[p][1].positive]
+            step, gain = _linear_gain(fitted, unseen, known, positive)
+            strengths = {p: float(info[p][0]) + step[known + i] for i, p in enumerate(paths)}
+            filled = model.with_effects(effect).replace(strengths).effect(effect.name)
+            changes = {p: step[i] for i, p in enumerate(free_now)}
+            begun = None if states is None else _filled_up(states, training)
+            yield Lead(filled, changes, gain, begun), null_gains(fitted, unseen, known)
+
+    leads: dict[str, Lead] = {}
+    chance = np.full(DRAWS * PARTNERS, -np.inf)
+    for lead, null in _of_all(looked_at, training, held_out, proposals, seed, strays=strays):
+        chance = np.maximum(chance, null)
+        if lead.effect.name not in leads or lead.gain > leads[lead.effect.name].gain:
+            leads[lead.effect.name] = lead
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
 
@@ -137,11 +143,16 @@ def _priors(fit: Fit) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, " f
     return np.asarray(free.off_prior(free.pack(fit.model))), slope
 
 
-def _responses(
-    training: Fit, held_out: Fit, proposals: Sequence[Effect], seed: int, *, strays: bool
-) -> Iterator[tuple[Effect, list[int], np.ndarray | None, tuple[Scores, Scores]]]:
-    """Each proposal, its columns, its hidden states at the start of each training segment, and the scores of training
-    and held-out data.
+def _of_all(
+    looked_at: Callable[[Responses], Iterable[Looked]],
+    training: Fit,
+    held_out: Fit,
+    proposals: Sequence[Effect],
+    seed: int,
+    *,
+    strays: bool,
+) -> list[Looked]:
+    """What is found of all proposals, form by form.
 
     Where the model's motion strays from the log, effects are evaluated along the measured motion too. The true one is
     between the two: an encoder reads a kinematic error as a twist that the spring does not have.
@@ -152,21 +163,23 @@ def _responses(
         measured = along_measured_motion(first, training), along_measured_motion(second, held_out)
         # Effects on the torque signal do not depend on the motion.
         passes.append((measured, [p for p in proposals if not isinstance(p, ActuatorEffect)]))
-    for motions, tried in passes:
-        for batch in batches(motions, tried, follow_on(training, held_out)):
-            fitted, unseen = (_scores(*pair) for pair in zip(motions, batch.answers, strict=True))
-            for effect, columns, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
-                yield effect, columns, states, (fitted, unseen)
+    goes_on = follow_on(training, held_out)
+
+    def of_form(given: tuple[tuple[FittedMotion, FittedMotion], list[Effect]]) -> list[Looked]:
+        motions, same = given
+        return [*looked_at(responses(motions, same, goes_on))]
+
+    forms = [
+        (motions, [p for p in tried if type(p) is form])
+        for motions, tried in passes
+        for form in dict.fromkeys(type(p) for p in tried)
+    ]
+    return [found for given in forms for found in of_form(given)]
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:
     """One row for each of a fit's segments; those without data repeat the last one with data."""
     return np.pad(states, ((0, len(fit.unknowns.states) - len(states)), (0, 0)), mode="edge")
-
-
-def _scores(fitted_motion: FittedMotion, answered: Answered) -> Scores:
-    columns = np.concatenate([fitted_motion.answers.parameters, answered], axis=-1)
-    return Scores.of(columns, fitted_motion.answers.weight, fitted_motion.residual, fitted_motion.surrogates)
 
 
 def _linear_gain(fitted: Scores, unseen: Scores, known: int, positive: list[int]) -> tuple[dict[int, float], float]:

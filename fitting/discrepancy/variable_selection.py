@@ -4,9 +4,7 @@ Along the fitted motion the problem is linear. The number of coefficients is cho
 data.
 """
 
-import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 
 import equinox as eqx
@@ -142,8 +140,7 @@ def candidates(seen: SearchContext, *, pairs: bool) -> list[Candidate]:
     may = {form: [name for name in seen.values if form.may_depend_on(name)] for form in forms}
 
     def look_at(form: type[Learned], choices: Iterable[tuple[str, ...]]) -> list[Candidate]:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = pool.map(lambda variables: _simplest(seen, form, variables, own[form]), choices)
+        found = (_simplest(seen, form, variables, own[form]) for variables in choices)
         return [candidate for candidate in found if candidate is not None]
 
     alone = {form: look_at(form, [(name,) for name in may[form]]) for form in forms}

@@ -1,6 +1,6 @@
-"""Fitted motions, and the responses to all proposals of the catalogue along them, in batches."""
+"""Fitted motions, and the responses to proposals of the catalogue along them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -19,15 +19,9 @@ from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.segments import Segments
 from fitting.first_order.close_following import followed_closely
 from fitting.first_order.motion import Along, along
-from fitting.first_order.regressors import regressors
-from fitting.first_order.surrogates import Surrogates
+from fitting.first_order.regressors import Regressors, regressors
+from fitting.first_order.surrogates import Scores, Surrogates
 from hdjax.effects import Effect
-
-# Numbers in the columns of a batch, limited by memory.
-_NUMBERS = 1 << 22
-
-# For training and held-out segments, whose numbers differ.
-Answered = Float[np.ndarray, "_ _ outputs columns"]
 
 
 class FittedMotion(eqx.Module):
@@ -38,12 +32,19 @@ class FittedMotion(eqx.Module):
         answers: responses of the residual to forces, and to free parameters in physical units.
         residual: whitened.
         surrogates: of the residual.
+        known: scores of the free parameters.
     """
 
     seen: Along
     answers: Answers
     residual: Float[np.ndarray, "segments samples outputs"]
     surrogates: Surrogates
+    known: Scores
+
+    def scores(self, regressors: Regressors) -> Scores:
+        """Scores of the free parameters and of an effect's strengths."""
+        columns = self.answers.to(regressors.forces, regressors.reading)
+        return self.known.with_columns(self.answers.parameters, columns, self.residual, self.surrogates)
 
 
 def fitted_motion(fit: Fit, seed: int) -> FittedMotion:
@@ -62,11 +63,13 @@ def fitted_motion(fit: Fit, seed: int) -> FittedMotion:
         before_by_parameter=jnp.asarray(np.asarray(found.before_by_parameter) / slopes),
     )
     followed, segments, residual = motion_and_residual(fit, problem, unknowns)
+    answers, surrogates = Answers.of(found, followed, segments, np.asarray(problem.whitening)), Surrogates.of(fit, seed)
     return FittedMotion(
         seen=along(fit.model, followed, segments, fit.stretches),
-        answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
+        answers=answers,
         residual=residual,
-        surrogates=Surrogates.of(fit, seed),
+        surrogates=surrogates,
+        known=Scores.of(answers.parameters, answers.weight, residual, surrogates),
     )
 
 
@@ -116,61 +119,40 @@ def follow_on(training: Fit, held_out: Fit) -> bool:
     return ends == [(s.name, s.start) for s in held_out.stretches]
 
 
-class Batch(eqx.Module):
-    """Proposals evaluated together.
+class Responses(eqx.Module):
+    """First-order responses to the proposals of one form.
 
     Attributes:
-        proposals: effects at zero strength.
-        columns: of each proposal.
-        answers: responses of the outputs to a unit of each strength, along the training motion and along the held-out
-            one.
+        proposals: effects of one form at zero strength.
+        columns: of each proposal, among those of the strengths.
+        scores: of the free parameters and the strengths, along the training motion and along the held-out one.
         own_states: hidden states of each proposal at the start of each training segment; None without any.
     """
 
     proposals: list[Effect]
     columns: list[list[int]]
-    answers: tuple[Answered, Answered]
+    scores: tuple[Scores, Scores]
     own_states: list[np.ndarray | None]
 
 
-def batches(
+def responses(
     fitted_motions: tuple[FittedMotion, FittedMotion], proposals: Sequence[Effect], goes_on: bool
-) -> Iterator[Batch]:
-    """Responses to the proposals, in batches of forms limited by memory.
+) -> Responses:
+    """Responses to proposals of one form.
 
     Args:
         fitted_motions: along training stretches, and along held-out ones.
-        proposals: effects at zero strength.
+        proposals: effects of one form at zero strength.
         goes_on: whether the held-out stretches begin at the ends of the training stretches, see [`follow_on`][].
     """
-    room = max(1, _NUMBERS // max(s.residual.size for s in fitted_motions))
-    waiting: list[Batch] = []
-    for form in dict.fromkeys(type(p) for p in proposals):
-        same = [p for p in proposals if type(p) is form]
-        fitted, memory = regressors(fitted_motions[0].seen, same)
-        unseen, _ = regressors(fitted_motions[1].seen, same, memory if goes_on else None)
-        strengths = len(strength_paths(same[0]))
-        columns = [list(range(i * strengths, (i + 1) * strengths)) for i in range(len(same))]
-        own = [None if memory is None else memory.at_starts[..., i] for i in range(len(same))]
-        first, second = (
-            s.answers.to(f.forces, f.reading) for s, f in zip(fitted_motions, (fitted, unseen), strict=True)
-        )
-        waiting.append(Batch(same, columns, (first, second), own))
-        if sum(batch.answers[0].shape[-1] for batch in waiting) >= room:
-            yield _together(waiting)
-            waiting = []
-    if waiting:
-        yield _together(waiting)
-
-
-def _together(parts: Sequence[Batch]) -> Batch:
-    """Batches joined into one."""
-    widths = [part.answers[0].shape[-1] for part in parts]
-    firsts = np.cumsum(widths) - widths
-    columns = [[int(first) + c for c in own] for part, first in zip(parts, firsts, strict=True) for own in part.columns]
-    first, second = (np.concatenate(own, axis=-1) for own in zip(*(part.answers for part in parts), strict=True))
-    proposals, own = ([one for part in parts for one in getattr(part, name)] for name in ("proposals", "own_states"))
-    return Batch(proposals, columns, (first, second), own)
+    first, second = fitted_motions
+    fitted, memory = regressors(first.seen, proposals)
+    unseen, _ = regressors(second.seen, proposals, memory if goes_on else None)
+    strengths = len(strength_paths(proposals[0]))
+    columns = [list(range(i * strengths, (i + 1) * strengths)) for i in range(len(proposals))]
+    own = [None if memory is None else memory.at_starts[..., i] for i in range(len(proposals))]
+    scores = first.scores(fitted), second.scores(unseen)
+    return Responses(list(proposals), columns, scores, own)
 
 
 def _linearised(fit: Fit) -> tuple[Problem, Unknowns]:

@@ -53,7 +53,7 @@ class Surrogates(eqx.Module):
         series = columns[self.counts]
         series, further = series[: self.length], series[self.length :]
         series[: len(further)] += further
-        found: Any = rfft(series, axis=0, overwrite_x=True, workers=-1)
+        found: Any = rfft(series, axis=0, overwrite_x=True)
         across = _represented(self.length)[:, None] / self.length * np.einsum("of,foc->fc", self.spectrum, found.conj())
         return np.real(self.turns @ across).T
 
@@ -149,6 +149,32 @@ class Scores(Record):
         samples = max(float(np.sum(weight)), 1.0)
         error = residual.reshape(-1)
         return cls(gram, flat.T @ error, surrogates.against(columns), float(error @ error), samples)
+
+    def with_columns(
+        self,
+        columns: Float[np.ndarray, "segments samples outputs columns"],
+        further: Float[np.ndarray, "segments samples outputs further"],
+        residual: Float[np.ndarray, "segments samples outputs"],
+        surrogates: Surrogates,
+    ) -> "Scores":
+        """The scores with further columns.
+
+        Args:
+            columns: those that these are the scores of.
+            further: others, which come behind them.
+            residual: as in [`of`][].
+            surrogates: likewise.
+        """
+        flat, own = (values.reshape(-1, values.shape[-1]) for values in (columns, further))
+        with np.errstate(over="ignore", invalid="ignore"):
+            across, gram = flat.T @ own, own.T @ own
+        return Scores(
+            np.block([[self.gram, across], [across.T, gram]]),
+            np.concatenate([self.gradient, own.T @ residual.reshape(-1)]),
+            np.concatenate([self.surrogate_gradients, surrogates.against(further)]),
+            self.square,
+            self.samples,
+        )
 
     def columns(self, which: list[int]) -> "Scores":
         """The scores of some columns."""

@@ -70,8 +70,8 @@ def test_sweep_file_defines_model_forcing_and_points(tmp_path):
         ('"steady"', '["steady"]', r"\[sweep\] response must be one of"),
         (
             "k2 = 0.5",
-            "k2 = 0.5\n[effects.dahl]\nyield_twist = -1e-4",
-            "yield_twist must lie within 0",
+            "k2 = 0.5\n[effects.backlash]\nb = -1e-4",
+            "b must lie within 0",
         ),
     ],
 )

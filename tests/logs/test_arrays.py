@@ -114,7 +114,7 @@ def test_sample_time_of_iddata_has_its_unit(tmp_path: Path):
     assert read_table(tmp_path / "z.mat", ["InputData"]).sample_rate == 2000.0
 
 
-@pytest.mark.parametrize(("unit", "rate"), [("milliseconds", 2000.0), ("fortnights", None)])
+@pytest.mark.parametrize(("unit", "rate"), [("milliseconds", 2000.0), ("parsecs", None)])
 @pytest.mark.parametrize("stored", ["text", "attribute", "MATLAB"])
 def test_sample_time_in_hdf5_has_its_unit(tmp_path: Path, stored: str, unit: str, rate: float | None):
     path = hdf5(tmp_path, {"a": A, "Ts": 0.5})

@@ -207,7 +207,6 @@ def test_close_loop_reports_that_the_linear_curve_suffices(tmp_path: Path, capsy
         (table() | {"twist": np.full(400, 1e-3)}, [], 1, "dynamic_error"),
         (table(), ["--max-effects", "-1"], 2, "--max-effects"),
         (table(), ["--next-experiment"], 2, "quasi-static"),
-        (table(), ["--posterior"], 2, "quasi-static"),
     ],
 )
 def test_close_loop_refuses_invalid_input_in_one_sentence(
@@ -222,6 +221,13 @@ def test_close_loop_refuses_invalid_input_in_one_sentence(
     assert run("close-loop", log, "--drive", file, "--out", tmp_path / "out", *options) == code
     message = capsys.readouterr().err
     assert words in message and message.count("\n") == 1 and "Traceback" not in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_fit_refuses_draws_for_a_quasi_static_log(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table())
+    assert run("fit", log, "--drive", drive, "--out", tmp_path / "out", "--posterior") == 2
+    assert "quasi-static log has no draws" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
