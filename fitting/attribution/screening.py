@@ -5,7 +5,7 @@ its motion. Least squares with these regressors gives each effect's strength and
 also on held-out data. Applied to surrogates of the residual, it gives the null distribution of the best gain.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Generic
 
@@ -19,8 +19,6 @@ from fitting.estimation.free_parameters import MESH, strength_paths
 from fitting.estimation.scales import scales
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import (
-    FittedMotion,
-    Responses,
     along_measured_motion,
     fitted_motion,
     follow_on,
@@ -53,8 +51,6 @@ class Lead(eqx.Module):
     own_states: Float[np.ndarray, "segments own"] | None = None
 
 
-# First-order estimates of a proposal, and the null distribution of its gain.
-Looked = tuple[Lead, Float[np.ndarray, " draws"]]
 # Type of a form's screening result, also of quasi-static logs.
 LeadT = TypeVar("LeadT", default=Lead)
 
@@ -106,31 +102,26 @@ def screen(
     off, slope = _priors(training)
     free_mesh = np.where([path in MESH for path in training.free.paths], 0.0, slope)
 
-    def looked_at(found: Responses) -> Iterator[tuple[Lead, np.ndarray]]:
-        """First-order estimates of proposals, and null distributions of their gains."""
-        for effect, own, states in zip(found.proposals, found.columns, found.own_states, strict=True):
-            used = [*range(known), *(skipped + known + c for c in own)]
-            fitted, unseen = (scores.columns(used) for scores in found.scores)
-            if known:
-                fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
-            if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
-                # Its response diverges along this motion: nothing is known to first order.
-                continue
-            paths, info = strength_paths(effect), model.with_effects(effect).parameters()
-            positive = [known + i for i, p in enumerate(paths) if info[p][1].positive]
-            step, gain = _linear_gain(fitted, unseen, known, positive)
-            strengths = {p: float(info[p][0]) + step[known + i] for i, p in enumerate(paths)}
-            filled = model.with_effects(effect).replace(strengths).effect(effect.name)
-            changes = {p: step[i] for i, p in enumerate(free_now)}
-            begun = None if states is None else _filled_up(states, training)
-            yield Lead(filled, changes, gain, begun), null_gains(fitted, unseen, known)
-
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
-    for lead, null in _of_all(looked_at, training, held_out, proposals, seed, strays=strays):
-        chance = np.maximum(chance, null)
-        if lead.effect.name not in leads or lead.gain > leads[lead.effect.name].gain:
-            leads[lead.effect.name] = lead
+    for effect, own, states, scores in _responses(training, held_out, proposals, seed, strays=strays):
+        used = [*range(known), *(skipped + known + c for c in own)]
+        fitted, unseen = (each.columns(used) for each in scores)
+        if known:
+            fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
+        if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
+            # Its response diverges along this motion: nothing is known to first order.
+            continue
+        paths, info = strength_paths(effect), model.with_effects(effect).parameters()
+        positive = [known + i for i, p in enumerate(paths) if info[p][1].positive]
+        step, gain = _linear_gain(fitted, unseen, known, positive)
+        chance = np.maximum(chance, null_gains(fitted, unseen, known))
+        if effect.name in leads and leads[effect.name].gain >= gain:
+            continue
+        strengths = {p: float(info[p][0]) + step[known + i] for i, p in enumerate(paths)}
+        filled = model.with_effects(effect).replace(strengths).effect(effect.name)
+        changes = {p: step[i] for i, p in enumerate(free_now)}
+        leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
 
@@ -143,16 +134,11 @@ def _priors(fit: Fit) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, " f
     return np.asarray(free.off_prior(free.pack(fit.model))), slope
 
 
-def _of_all(
-    looked_at: Callable[[Responses], Iterable[Looked]],
-    training: Fit,
-    held_out: Fit,
-    proposals: Sequence[Effect],
-    seed: int,
-    *,
-    strays: bool,
-) -> list[Looked]:
-    """What is found of all proposals, form by form.
+def _responses(
+    training: Fit, held_out: Fit, proposals: Sequence[Effect], seed: int, *, strays: bool
+) -> Iterator[tuple[Effect, list[int], np.ndarray | None, tuple[Scores, Scores]]]:
+    """Each proposal, its columns, its hidden states at the start of each training segment, and the scores of its form
+    along training and held-out data.
 
     Where the model's motion strays from the log, effects are evaluated along the measured motion too. The true one is
     between the two: an encoder reads a kinematic error as a twist that the spring does not have.
@@ -164,17 +150,11 @@ def _of_all(
         # Effects on the torque signal do not depend on the motion.
         passes.append((measured, [p for p in proposals if not isinstance(p, ActuatorEffect)]))
     goes_on = follow_on(training, held_out)
-
-    def of_form(given: tuple[tuple[FittedMotion, FittedMotion], list[Effect]]) -> list[Looked]:
-        motions, same = given
-        return [*looked_at(responses(motions, same, goes_on))]
-
-    forms = [
-        (motions, [p for p in tried if type(p) is form])
-        for motions, tried in passes
-        for form in dict.fromkeys(type(p) for p in tried)
-    ]
-    return [found for given in forms for found in of_form(given)]
+    for motions, tried in passes:
+        for form in dict.fromkeys(type(p) for p in tried):
+            found = responses(motions, [p for p in tried if type(p) is form], goes_on)
+            for effect, columns, states in zip(found.proposals, found.columns, found.own_states, strict=True):
+                yield effect, columns, states, found.scores
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:

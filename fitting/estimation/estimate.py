@@ -374,6 +374,11 @@ def log_of(stretch: Stretch) -> str:
     return stretch.experiment.log
 
 
+def followed_error(found: Fit) -> Float[np.ndarray, "segments samples outputs"]:
+    """The whitened output error; zero in the segments in which the simulation diverges."""
+    return np.where(lost(found)[:, None, None], 0.0, found.white_error)
+
+
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     """The segments in which the simulation diverges."""
     return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))

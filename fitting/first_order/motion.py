@@ -156,7 +156,7 @@ def unit_pushes(
 def unit_readings(
     model: Model, states: Float[Array | np.ndarray, "segments samples states"], segments: Segments
 ) -> dict[str, Float[np.ndarray, "segments samples outputs"]]:
-    """Change of the outputs at the samples by the same units. None without a sensor of the joint torque, which
+    """Change of the outputs at the samples by the same units; empty without a sensor of the joint torque, which
     measures a torque in the mesh directly."""
     if JOINT_TORQUE not in model.measured:
         return {}

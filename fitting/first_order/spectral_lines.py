@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from fitting.estimation.estimate import Fit, lost
+from fitting.estimation.estimate import Fit, followed_error
 
 # Largest number of lines.
 _MOST = 3
@@ -26,8 +26,7 @@ def spectral_lines(fit: Fit) -> tuple[float, ...]:
         fit: a fit.
     """
     # Invalid samples of the longest stretch are zero, and segments in which the simulation diverges.
-    white = np.where(lost(fit)[:, None, None], 0.0, fit.white_error)
-    pairs = zip(fit.stretches, fit.by_stretch(white), strict=True)
+    pairs = zip(fit.stretches, fit.by_stretch(followed_error(fit)), strict=True)
     stretch, series = max(reversed([*pairs]), key=lambda pair: len(pair[1]))
     count = series.shape[0]
     if count < 4 * _NEIGHBOURS:

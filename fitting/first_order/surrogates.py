@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from fitting.estimation.estimate import Fit, lost
+from fitting.estimation.estimate import Fit, followed_error, lost
 from fitting.estimation.projection import solved
 from fitting.first_order.spectral_lines import without_lines
 from fitting.record import Record
@@ -40,7 +40,7 @@ class Surrogates(eqx.Module):
         """Surrogates of a fit's whitened residual, in its segments with data that do not diverge."""
         random = np.random.default_rng(seed)
         weight = _used(fit)
-        spectrum, length = _noise_spectrum(fit.white_error[weight].T)
+        spectrum, length = _noise_spectrum(followed_error(fit)[weight].T)
         turns = np.stack([_turn(random, spectrum) for _ in range(DRAWS)])
         return cls(spectrum, turns, length, weight[: fit.pieces.sum()])
 
@@ -71,8 +71,10 @@ def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
     """
     random = np.random.default_rng(seed)
     weight = _used(before) & _used(after)
+    if not weight.any():
+        return 1.0
     changed = (np.asarray(before.error) - np.asarray(after.error)) @ np.asarray(before.problem.whitening).T
-    spectrum, length = _noise_spectrum(before.white_error[weight].T)
+    spectrum, length = _noise_spectrum(followed_error(before)[weight].T)
     series = changed[weight].T
     against = _represented(length) / length * np.sum(np.fft.rfft(series[:, :length]).conj() * spectrum, axis=0)
     draws = DRAWS * PARTNERS
@@ -82,8 +84,10 @@ def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
 
 
 def _used(fit: Fit) -> Bool[np.ndarray, "segments samples"]:
-    """Valid samples of the segments in which the simulation does not diverge."""
-    return (np.asarray(fit.problem.segments.weight) > 0) & ~lost(fit)[:, None]
+    """Valid samples of the segments in which the simulation does not diverge; of all where it always does."""
+    valid = np.asarray(fit.problem.segments.weight) > 0
+    followed = valid & ~lost(fit)[:, None]
+    return followed if followed.any() else valid
 
 
 def _represented(length: int) -> Float[np.ndarray, " frequencies"]:
