@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -52,6 +53,11 @@ class Trial(eqx.Module):
     def gain_over(self, before: "Trial") -> float:
         """Decrease of the held-out objective; of a model with memory, the part that persists over whole stretches."""
         return (before.held_out.objective - self.held_out.objective) * self.lasting
+
+    @cached_property
+    def along_whole_stretches(self) -> Fit:
+        """The held-out fit along whole stretches, whose initial states are fitted to all samples."""
+        return without_gaps(over_whole_stretches(self.held_out, least_progress=LEAST_PROGRESS))
 
 
 def attempt(
@@ -240,10 +246,9 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
 
 
 def long_gains(before: Trial, trials: Sequence[Trial]) -> list[float] | None:
-    """Gains of trials over the preceding model along whole held-out stretches, whose initial states are fitted to all
-    samples. None where no model follows the drive for so long, or the preceding one diverges.
-    """
-    whole = [without_gaps(over_whole_stretches(t.held_out, least_progress=LEAST_PROGRESS)) for t in (before, *trials)]
+    """Gains of trials over the preceding model along whole held-out stretches. None where no model follows the drive
+    for so long, or the preceding one diverges."""
+    whole = [trial.along_whole_stretches for trial in (before, *trials)]
     first, *others = (fitted.objective for fitted in whole)
     if not (np.isfinite(first) and any(follows(fitted) for fitted in whole)):
         return None

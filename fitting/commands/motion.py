@@ -46,7 +46,7 @@ def simulate(
     model
         model.json of a report; a preset where not given.
     preset
-        Name of a drive with published parameters.
+        Name of a drive with published parameters; HDC-40-050 is the only one.
     noise
         Rms noise of each angle [rad at the output].
     seed

@@ -47,7 +47,7 @@ class DriveOptions:
     """The drive of a command.
 
     Attributes:
-        preset: Name of a drive with published parameters.
+        preset: Name of a drive with published parameters; HDC-40-050 is the only one.
         model: model.json of a report, in place of a preset. Of its effects only `speeds` uses one, the kinematic error.
         K: Torsional stiffness [N m/rad] in place of the drive's own.
         alpha: Cubic stiffness coefficient [rad^-2] in place of the drive's own.
