@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -67,7 +68,7 @@ def show_speeds(
             f"{drive.model}: {over[0]} does not repeat with the motor's revolution; give a model without it"
         )
     around = jnp.linspace(0.0, 2 * jnp.pi, 4096, endpoint=False)
-    whole = np.asarray(sum(error.error(around) for error in own))
+    whole = np.asarray(sum(jax.vmap(error.error)(around) for error in own))
     size = float(np.max(np.abs(whole)))
     if not size > 0.0:
         raise InputError(f"{drive.model}: its kinematic error is zero; give a model with one, or none and a preset")

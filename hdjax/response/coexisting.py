@@ -3,13 +3,14 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from hdjax.dynamics import Model
 from hdjax.fourier import FourierSeries
 from hdjax.response.continuation import Branch, frequency_response
 
-_SAME = 1e-6
+# Difference of equal motions in scaled unknowns, from the tolerance of the continuation (assumed).
+_SAME = 1e-4
 
 
 def from_both_ends(
@@ -31,5 +32,11 @@ def from_both_ends(
     up, down = (
         frequency_response(model, forcing, start, end, **options) for start, end in ((slow, fast), (fast, slow))
     )
-    met = bool(up.complete & jnp.allclose(up.unknowns[-1], down.unknowns[0], rtol=0.0, atol=_SAME))
+    met = bool(up.complete & jnp.allclose(_last(up, down.omega[0]), down.unknowns[0], rtol=0.0, atol=_SAME))
     return tuple(branch.within(slow, fast) for branch in ((up,) if met else (up, down)))
+
+
+def _last(branch: Branch, omega: Array) -> Float[Array, " unknowns"]:
+    """The last motion of a branch at a frequency close to its end, where the continuation stops within a tolerance."""
+    (before, last), (start, end) = branch.unknowns[-2:], branch.omega[-2:]
+    return last + (last - before) * (omega - end) / (end - start)

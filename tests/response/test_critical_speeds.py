@@ -9,6 +9,7 @@ import pytest
 from hdjax import Drive
 from hdjax.dynamics import TwoInertiaModel
 from hdjax.effects.kinematic import KinematicError
+from hdjax.response.coexisting import from_both_ends
 from hdjax.response.continuation import Branch, frequency_response
 from hdjax.response.critical_speeds import can_persist, critical_speeds, speeds_to_avoid
 from hdjax.response.plots import speed_plot
@@ -82,6 +83,13 @@ def test_branch_with_folds_gives_one_speed_band():
     assert band.end > speed[back].max()
     assert band.amplitude == pytest.approx(np.asarray(softening.steady_states.swing)[lasting].max())
     assert can_persist(branch()).all()
+
+
+def test_response_of_a_linear_drive_is_one_branch_from_both_ends():
+    """The continuation stops within a tolerance of the range's end."""
+    model = TwoInertiaModel(DRIVE, (KinematicError(cos_1=2e-5, cos_2=1e-4),))
+    options = {"rotating": True, "harmonics": 6, "points": 300}
+    assert len(from_both_ends(model, None, 0.03 * OMEGA_0, 0.95 * OMEGA_0, **options)) == 1
 
 
 def test_limit_above_the_peak_gives_no_speed_band():
