@@ -123,6 +123,8 @@ class IdentificationTime(LogMeasure):
                 "`identification_time` must have positive noise and relative_error, but has "
                 f"{self.noise:g} rad and {self.relative_error:g}"
             )
+        if float(case.drive.alpha) == 0.0:
+            raise ValueError("`identification_time` needs a cubic stiffness to determine, but alpha is zero")
 
     def __call__(self, case: Case) -> Array:
         standard = jnp.log(self.standard_errors(case) / self.relative_error)

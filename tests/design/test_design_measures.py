@@ -236,6 +236,7 @@ def test_largest_twist_from_rest_is_one_to_two_steady_amplitudes():
         (SettlingTime(0.0, 1e-5), case(), "must have a torque"),
         (LargestTwist(100.0, 1.0), case(amplitude=1.0), "raise rate"),
         (IdentificationTime(2000.0, 1.0, 0.0), case(amplitude=1.0), "positive noise"),
+        (IdentificationTime(2000.0, 1.0, 1e-6), case(0.0, amplitude=1.0), "alpha is zero"),
     ],
 )
 def test_measure_refuses_unusable_settings(measure: Measure, at: Case, message: str):
