@@ -20,6 +20,7 @@ from typing import Any, Literal
 import jax
 import polars as pl
 
+from fitting.blas import one_blas_thread
 from fitting.drive_data import Rig, read_rig
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
@@ -61,6 +62,8 @@ def find_logs(folder: Path, *, apart_from: Path) -> tuple[Path, ...]:
     return tuple(found)
 
 
+# Held over all logs: a fit that ends in one thread would give BLAS its threads back while others go on.
+@one_blas_thread
 def fit_fleet(
     folder: Path,
     drive: Path,

@@ -25,7 +25,7 @@ from hdjax.response.critical_speeds import SpeedBand, can_persist, critical_spee
 from hdjax.response.plots import speed_plot
 
 _RPM = 30.0 / math.pi
-_SMALLEST_LINE = 0.01  # of a learned error, of the largest one: below it the resonance is a hundredth of the other
+_SMALLEST_LINE = 0.01  # of the largest line of an error; smaller ones of a learned error are its noise (assumed)
 _BEYOND = 10.0  # times the natural frequency: the last resonance, a sub-harmonic, is at three times it
 
 

@@ -33,17 +33,22 @@ def parted(
         would have no stretch to fit, or the test part would be too short to estimate an error.
     """
     border = len(log) - round(share * len(log))
-    if share > 0.0 and len(log) - border >= _FEWEST:
-        known, end = log.rows(0, border), log.rows(border, len(log))
-        try:
-            end = masked(end)
-        except DataError:
-            pass
-        else:
-            if known.pieces != () and end.pieces != ():
-                known = zeroed(masked(known), drive_file, zeros=zeros)
-                return known, counted_from(end, known.zero)
-    return zeroed(masked(log), drive_file, zeros=zeros), None
+    known, end = log.rows(0, border), None
+    if share > 0.0 and len(log) - border >= _FEWEST and known.pieces != ():
+        end = _end(log, border)
+    if end is None:
+        return zeroed(masked(log), drive_file, zeros=zeros), None
+    known = zeroed(masked(known), drive_file, zeros=zeros)
+    return known, counted_from(end, known.zero)
+
+
+def _end(log: Log, border: int) -> Log | None:
+    """The rows from a border on, masked; None where they hold no stretch, or too few valid samples."""
+    try:
+        end = masked(log.rows(border, len(log)))
+    except DataError:
+        return None
+    return None if end.pieces == () else end
 
 
 def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:

@@ -43,8 +43,11 @@ class FittedMotion(eqx.Module):
 
     def scores(self, regressors: Regressors) -> Scores:
         """Scores of the free parameters and of an effect's strengths."""
-        columns = self.answers.to(regressors.forces, regressors.reading)
-        return self.known.with_columns(self.answers.parameters, columns, self.residual, self.surrogates)
+        columns, known = self.answers.to(regressors.forces, regressors.reading), self.answers.parameters
+        own = Scores.of(columns, self.answers.weight, self.residual, self.surrogates)
+        with np.errstate(over="ignore", invalid="ignore"):
+            across = known.reshape(-1, known.shape[-1]).T @ columns.reshape(-1, columns.shape[-1])
+        return self.known.joined(own, across)
 
 
 def fitted_motion(fit: Fit, seed: int) -> FittedMotion:

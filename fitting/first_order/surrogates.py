@@ -154,28 +154,17 @@ class Scores(Record):
         error = residual.reshape(-1)
         return cls(gram, flat.T @ error, surrogates.against(columns), float(error @ error), samples)
 
-    def with_columns(
-        self,
-        columns: Float[np.ndarray, "segments samples outputs columns"],
-        further: Float[np.ndarray, "segments samples outputs further"],
-        residual: Float[np.ndarray, "segments samples outputs"],
-        surrogates: Surrogates,
-    ) -> "Scores":
-        """The scores with further columns.
+    def joined(self, further: "Scores", across: Float[np.ndarray, "columns further"]) -> "Scores":
+        """The scores of these columns and of further ones, on the same residual.
 
         Args:
-            columns: those that these are the scores of.
-            further: others, which come behind them.
-            residual: as in [`of`][].
-            surrogates: likewise.
+            further: those of the further columns.
+            across: inner products of the two.
         """
-        flat, own = (values.reshape(-1, values.shape[-1]) for values in (columns, further))
-        with np.errstate(over="ignore", invalid="ignore"):
-            across, gram = flat.T @ own, own.T @ own
         return Scores(
-            np.block([[self.gram, across], [across.T, gram]]),
-            np.concatenate([self.gradient, own.T @ residual.reshape(-1)]),
-            np.concatenate([self.surrogate_gradients, surrogates.against(further)]),
+            np.block([[self.gram, across], [across.T, further.gram]]),
+            np.concatenate([self.gradient, further.gradient]),
+            np.concatenate([self.surrogate_gradients, further.surrogate_gradients]),
             self.square,
             self.samples,
         )

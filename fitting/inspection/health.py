@@ -63,7 +63,7 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
 def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:
     """Findings on the columns where they do not make up a log."""
     table, time = inspection.tables[k], inspection.time
-    found = [*sampling_findings(table, time)]
+    found = [*sampling_findings(table, time, inspection.clocks[k])]
     for guess in inspection.joint.signals.values():
         values = table.column(guess.column).values
         blank = int((~np.isfinite(values)).sum())

@@ -13,7 +13,7 @@ from fitting.inspection.hypotheses import ANGLES, COPY, OTHERS, Evidence, hypoth
 from fitting.inspection.reasons import physical_reasons
 from fitting.inspection.relations import Relations
 from fitting.inspection.settling import SURE, RatioGuess, UnitGuess, ratio_of, signs_of, units_of
-from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time, own_base
+from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time
 from fitting.inspection.unit_evidence import is_counts, si_size
 from fitting.inspection.windows import Uniform, scales, uniform
 from fitting.logs.channels import SI
@@ -148,7 +148,7 @@ class Inspection:
     def samples(self, signal: str, log: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Stamps [s] and values of a signal of the chosen joint, in SI as guessed, (n,) each, if both are known."""
         guess = self.joint.signals[signal]
-        values, own = _samples(self.tables[log], guess.column, self.clocks[log], self.time)
+        values, own = _samples(self.tables[log], guess.column, self.clocks[log])
         stamps = self.clocks[log].base.time if own is None else own
         known = np.isfinite(values) & np.isfinite(stamps)
         return stamps[known], guess.sign * guess.in_si(values[known])
@@ -247,7 +247,7 @@ def _joint(
     if not columns:
         return JointInspection(label, {}, {}, {}, None, 0.0)
     logs = [
-        uniform(clock.base.time, [_samples(table, c.name, clock, time) for c in columns])
+        uniform(clock.base.time, [_samples(table, c.name, clock) for c in columns])
         for table, clock in zip(tables, clocks, strict=True)
     ]
     moves = np.array([any(not table.column(c.name).constant for table in tables) for c in columns], dtype=bool)
@@ -269,10 +269,9 @@ def _as_others(joint: JointInspection, joints: Sequence[JointInspection], table:
     return replace(joint, signals={name: known(guess) for name, guess in joint.signals.items()})
 
 
-def _samples(table: Table, name: str, clock: Clock, time: TimeGuess) -> tuple[np.ndarray, np.ndarray | None]:
+def _samples(table: Table, name: str, clock: Clock) -> tuple[np.ndarray, np.ndarray | None]:
     """The values of a column and its stamps, or those of the table's clock."""
-    column = table.column(name)
-    values, own = _unwrapped(column), own_base(table, column, time)
+    values, own = _unwrapped(table.column(name)), clock.own.get(name)
     return (values[clock.base.rows], None) if own is None else (values[own.rows], own.time)
 
 

@@ -62,10 +62,12 @@ class Clock:
     Attributes:
         base: Stamps [s] and their rows.
         known: Whether the unit of time is known; if not, a row counts as a second.
+        own: Of the columns with separate clocks, by name; without rows where the stamps are no clock.
     """
 
     base: TimeBase
     known: bool
+    own: dict[str, TimeBase]
 
 
 def guess_time(table: Table) -> TimeGuess:
@@ -140,7 +142,7 @@ def _clocks(table: Table, first: str) -> dict[str, str]:
     return clocks
 
 
-def own_base(table: Table, column: Column, guess: TimeGuess) -> TimeBase | None:
+def _own_base(table: Table, column: Column, guess: TimeGuess) -> TimeBase | None:
     """The time base of a column with a separate clock, without rows where it is none; None if it has the table's."""
     stamps = column.time
     if column.name in guess.clocks:
@@ -159,18 +161,18 @@ def own_base(table: Table, column: Column, guess: TimeGuess) -> TimeBase | None:
 def clock_of(table: Table, guess: TimeGuess) -> Clock:
     """The stamps of a table by the guessed clock column."""
     rows = np.arange(table.rows)
+    own = {c.name: base for c in table.columns if (base := _own_base(table, c, guess)) is not None}
     if guess.column is not None:
         try:
-            return Clock(_base(table, guess), True)
+            return Clock(_base(table, guess), True, own)
         except InputError:
             pass
     step = 1.0 / table.sample_rate if table.sample_rate else 1.0
-    bases = [base for column in table.columns if (base := own_base(table, column, guess)) is not None]
     # The fastest clock has the finest grid.
-    finest = max(bases, key=lambda base: len(base.rows), default=None)
+    finest = max(own.values(), key=lambda base: len(base.rows), default=None)
     if finest is not None and len(finest.rows):
-        return Clock(finest, True)
-    return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None)
+        return Clock(finest, True, own)
+    return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None, own)
 
 
 def _base(table: Table, guess: TimeGuess) -> TimeBase:
@@ -188,12 +190,11 @@ def _base(table: Table, guess: TimeGuess) -> TimeBase:
     )
 
 
-def sampling_findings(table: Table, guess: TimeGuess) -> tuple[Finding, ...]:
+def sampling_findings(table: Table, guess: TimeGuess, clock: Clock) -> tuple[Finding, ...]:
     """Corrections of the stamps, or why there are none."""
     if guess.column is None:
-        own = [own_base(table, column, guess) for column in table.columns]
-        wrong = [c.name for c, base in zip(table.columns, own, strict=True) if base is not None and not len(base.rows)]
         told = "the stamps are constant, run backwards or are blank"
+        wrong = [name for name, base in clock.own.items() if not len(base.rows)]
         return tuple(Finding("refusal", told, name, "the column has no time base") for name in wrong)
     try:
         return _base(table, guess).findings

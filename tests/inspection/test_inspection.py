@@ -208,7 +208,7 @@ def test_own_clocks_of_channels_are_mended_or_refused(kind: str, drive_log: dict
     table = read_columns(Path("recording"), {name: c for name, c in drive_log.items() if name != "time"})
     own = tuple(replace(c, values=c.values[: len(stamps)], time=stamps) for c in table.columns)
     found = inspect_tables([replace(table, columns=own)])
-    told = sampling_findings(found.tables[0], found.time)
+    told = sampling_findings(found.tables[0], found.time, found.clocks[0])
     if kind == "batched":
         assert found.rates[0] == pytest.approx(1.0 / np.diff(time).mean(), rel=1e-2)
         assert not told
