@@ -17,7 +17,7 @@ from fitting.discrepancy.learn import Unknown, learn_supported
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.estimation.one_side import held_at
-from fitting.estimation.whole_log_fit import long_fit
+from fitting.estimation.whole_log_fit import follows, long_fit
 from fitting.one_side_check import better_side
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
@@ -98,6 +98,9 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
         much = explained is None or explained >= RULES.free_run_explained
         if not (much and challenge.seen.enough):
             ratio = surprise(fitted, runs, current.held_out, **known)
+            if ratio is not None:
+                # What is slow may differ between the fitted part of a log and the rest.
+                ratio = max(ratio, surprise(fitted, None, current.training, **known) or 0.0)
             seen = replace(seen, surprise=ratio, wide_bands=ratio is None)
         outcome, _ = conclude(seen)
     found = Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left, side)
@@ -135,9 +138,11 @@ def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[F
     if max(seen.excess) < RULES.excess:
         return long_fit(found), None
     side = study.side_of(found.model) or better_side(found)
-    if side is None and found.was_held:
-        return found, None
-    return long_fit(found if side is None else held_at(side.model, found, side.free.paths)), side
+    if side is None:
+        return found if found.was_held else long_fit(found), None
+    held = held_at(side.model, found, side.free.paths)
+    # What was learned in the mesh beside other values may not suit the side's.
+    return (long_fit(held), side) if follows(held) else (long_fit(found), None)
 
 
 def _final_evidence(

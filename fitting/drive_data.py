@@ -84,12 +84,10 @@ def rig_of(
     for known, _ in parts:
         findings[known.name] = examine(known, drive_file)
         refuse_unfit(findings[known.name], known)
-    for log in test:
-        findings[log.name] = examine(log, drive_file)
-    fitted = tuple(known for known, _ in parts)
-    tests = [whole_test_log(log, drive_file, zeros=zeros) for log in test] or [
-        end for _, end in parts if end is not None
-    ]
+    fitted, tests = tuple(known for known, _ in parts), [end for _, end in parts if end is not None]
+    if test:
+        tests = [whole_test_log(log, drive_file, zeros=zeros) for log in test]
+        findings |= {log.name: examine(log, drive_file) for log in tests}
     # The end of a log keeps its clock.
     starts = {log.name: float(log.time[0]) for log in (*fitted, *test)}
     return Rig(

@@ -130,8 +130,8 @@ class Loop(eqx.Module):
         setting: segmentation of the logs.
         after_substeps: solver steps in a sample interval of the final model.
         stretches: training and selection stretches.
-        surprise: error of free runs along selection stretches over their bands, where effects were accepted that leave
-            more than noise, or do not explain them; None otherwise, or where bands say nothing.
+        surprise: error of free runs over their bands, the larger one of training and selection data, where effects were
+            accepted that leave more than noise, or do not explain them; None otherwise, or where bands say nothing.
         parameters_from: "torque"; or the "load equation" or "motor equation" for K, alpha and B_sp of the final model,
             see [`fitting.one_side_check`][].
         put_back: time offset subtracted from each log's clock [s], so that a line is in phase.

@@ -10,7 +10,8 @@ import numpy as np
 from fitting.drive_data import Rig, experiments, read_rig, ready_log
 from fitting.errors import DataError
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_run import WINDOW, free_run
+from fitting.estimation.free_run import free_run
+from fitting.estimation.initial_states import WINDOW
 from fitting.files import finite
 from fitting.logs.drive_file import DriveFile, read_drive_file
 from fitting.loop import close_loop

@@ -15,7 +15,8 @@ from fitting.api.results import Result
 from fitting.drive_data import WHY_NOT_QUASI_STATIC, experiments
 from fitting.errors import DataError, InputError
 from fitting.estimation.experiment import fitted_outputs, whole
-from fitting.estimation.free_run import WINDOW, FreeRun, as_logged, free_run
+from fitting.estimation.free_run import FreeRun, as_logged, free_run
+from fitting.estimation.initial_states import WINDOW
 from fitting.files import write_whole
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log

@@ -175,7 +175,8 @@ class FinalEvidence:
             the noise.
         excess_at_first: likewise of the base model.
         noise_explains: whether coloured noise of sensors and torque explains the residual.
-        surprise: free-run error over its prediction band; None where that is not checked, or the band says nothing.
+        surprise: free-run error over its prediction band, the larger one of selection and training data; None where
+            that is not checked, or the band says nothing.
         free_runs_explained: share of the free runs' error beyond noise that the effects remove; None where that is not
             checked, or all runs diverge.
         at_bounds: parameters of the named effects that ended at a bound in the final fit.

@@ -6,7 +6,7 @@ from pathlib import Path
 from fitting.api.data import load
 from fitting.api.prediction import predict
 from fitting.commands.spinner import spinning
-from fitting.estimation.free_run import WINDOW
+from fitting.estimation.initial_states import WINDOW
 
 
 def write_prediction(model: Path, log: Path, drive: Path, out: Path) -> None:

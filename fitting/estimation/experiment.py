@@ -55,6 +55,8 @@ class Experiment(Record):
         log: the name of the log that it is a part of.
         rate_std: relative standard deviation of the sample interval, from the rounding of the log's stamps.
         zero: what was subtracted from its dynamic error, see [`fitting.logs.zeroing`][].
+        has_own_zero: whether its zero is not known from other logs, so that a free run estimates it with its initial
+            state.
         outputs: names of the measured outputs, see `hdjax.dynamics.OUTPUTS`.
         moved: times by which readings are from later rows, see [`fitting.estimation.late_readings`][].
         shaft_torques: unit torques on a shaft whose estimated strengths are part of the torques, or None, see
@@ -74,6 +76,7 @@ class Experiment(Record):
     log: str = eqx.field(static=True, default="")
     rate_std: float = eqx.field(static=True, default=0.0)
     zero: float = eqx.field(static=True, default=0.0)
+    has_own_zero: bool = eqx.field(static=True, default=False)
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
     moved: Moved = eqx.field(static=True, default=Moved())
     shaft_torques: Float[np.ndarray, "n torques"] | None = None
@@ -85,6 +88,14 @@ class Experiment(Record):
         """A measured output by its name; None where it was not measured."""
         names = self.outputs or BOTH_ANGLES[-self.measured.shape[1] :]
         return self.measured[:, names.index(name)] if name in names else None
+
+    def less(self, offset: float) -> "Experiment":
+        """The experiment with so much subtracted from its dynamic error, the last output."""
+        if offset == 0.0:
+            return self
+        measured = self.measured.copy()
+        measured[:, -1] -= offset
+        return replace(self, measured=measured, zero=self.zero + offset)
 
     @property
     def time_step(self) -> float:
@@ -194,6 +205,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None, stated:
         log=log.name,
         rate_std=log.rate_std,
         zero=log.zero,
+        has_own_zero=log.has_own_zero,
         outputs=outputs,
     )
 

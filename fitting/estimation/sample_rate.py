@@ -26,15 +26,15 @@ _SEEN = 0.1
 _CHANGE = 1e-5
 
 
-class RateColumns(eqx.Module):
-    """Sensitivity of a fit's residual to the sample intervals of its logs.
+class LogColumns(eqx.Module):
+    """Sensitivity of a fit's residual to a constant of each of several logs.
 
     Attributes:
-        logs: logs of uncertain rate.
-        std: relative standard deviation of each log's interval, by its stamps alone.
+        logs: the logs.
+        std: prior standard deviation of each log's constant.
         residual: of the fit.
         parameters: its derivative by the free vector, projected orthogonal to the initial states.
-        columns: its derivative by the logarithm of each log's interval, projected likewise.
+        columns: its derivative by each log's constant, projected likewise.
     """
 
     logs: tuple[str, ...] = eqx.field(static=True)
@@ -44,8 +44,8 @@ class RateColumns(eqx.Module):
     columns: Float[np.ndarray, "segments rows logs"]
 
 
-def rate_columns(found: Fit) -> RateColumns | None:
-    """Sensitivities of a fit to the rates of its logs; None where all are known."""
+def rate_columns(found: Fit) -> LogColumns | None:
+    """Sensitivities of a fit to the logarithms of its logs' uncertain sample intervals; None where all are known."""
     open_logs = _open_logs([s.experiment for s in found.stretches])
     if not open_logs:
         return None
@@ -63,7 +63,7 @@ def rate_columns(found: Fit) -> RateColumns | None:
     of_log = np.stack([own[log] for log in open_logs], axis=-1)
     # A gap is a segment's initial state minus the preceding segment's final state.
     columns = states.without(change[:, :, None] * of_log[:, None], -gap[:, :, None] * of_log[:, None])
-    return RateColumns(
+    return LogColumns(
         logs=tuple(open_logs),
         std=np.array(list(open_logs.values())),
         residual=np.asarray(seen.residual),
@@ -81,20 +81,23 @@ def refined_intervals(found: Fit) -> dict[str, float]:
     seen = rate_columns(found)
     if seen is None:
         return {}
+    step, covariance = step_to_constants(found, seen)
+    if np.all(np.abs(step) < _SEEN * np.sqrt(np.diag(covariance))):
+        return {}
+    return {log: float(np.exp(s)) for log, s in zip(seen.logs, step[-len(seen.logs) :], strict=True)}
+
+
+def step_to_constants(found: Fit, seen: LogColumns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Gauss-Newton step of a fit's parameters and of a constant of each log, and their covariance."""
     columns = np.concatenate([seen.parameters, seen.columns], axis=2)
     columns = columns.reshape(-1, columns.shape[2])
-    count = len(seen.logs)
     precision, off = np.asarray(found.free.precision), np.asarray(found.free.off_prior(found.free.pack(found.model)))
     prior = np.diag(np.concatenate([precision**2, 1.0 / seen.std**2]))
     information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
     slope[: precision.size] += precision * off
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True)
-    step = -scale * (inverse @ (scale * slope))
-    spread = scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-    if np.all(np.abs(step / spread) < _SEEN):
-        return {}
-    return {log: float(np.exp(s)) for log, s in zip(seen.logs, step[-count:], strict=True)}
+    covariance = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+    return -covariance @ slope, covariance
 
 
 def with_intervals(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from fitting.errors import DataError
-from fitting.estimation.free_run import WINDOW
+from fitting.estimation.initial_states import WINDOW
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.log import Log
 from fitting.logs.masks import masked
@@ -52,8 +52,8 @@ def _end(log: Log, border: int) -> Log | None:
 
 
 def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
-    """A log that is test data as a whole. Its zero is that of a fitted log, if this suits the free run's initial-state
-    window; else it is estimated from that window.
+    """A log that is test data as a whole, masked, with the zero of the fitted logs where they tell it; else it has a
+    zero of its own ([`fitting.logs.zeroing.zeroed`][]).
 
     Args:
         log: as read.
@@ -64,5 +64,6 @@ def whole_test_log(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = 
         DataError: too few valid outputs.
     """
     ready = masked(log)
-    zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file, zeros=zeros).zero
-    return counted_from(ready, zero)
+    known = zeroed(replace(ready, outputs_until=WINDOW), drive_file, zeros=zeros)
+    found = replace(counted_from(ready, known.zero), has_own_zero=known.has_own_zero)
+    return replace(found, findings=known.findings)

@@ -76,6 +76,7 @@ class Log:
         input_known: Rows in which motor torque or forcing was sampled, (n,), or None for all.
         pieces: First row and one past the last of each stretch between gaps, or None for the whole log.
         zero: Sensor offset that was subtracted from the dynamic error.
+        has_own_zero: Whether it has a zero of its own, which few known outputs did not tell well.
         joint_torque: Torque behind the gear [N m], positive where it twists the drive positively, (n,), or None.
         rate_std: Relative standard deviation of the sample interval, from the rounding of the stamps.
     """
@@ -100,6 +101,7 @@ class Log:
     input_known: np.ndarray | None = None
     pieces: tuple[tuple[int, int], ...] | None = None
     zero: float = 0.0
+    has_own_zero: bool = False
     joint_torque: np.ndarray | None = None
     rate_std: float = 0.0
 

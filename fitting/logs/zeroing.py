@@ -19,12 +19,22 @@ _WIDTHS = (16, 32, 64, 128, 256)
 _EVEN = 0.2
 _FEWEST = 25
 
+_OWN_ZERO = Finding(
+    "note",
+    "the zero of the dynamic error is not known from other logs",
+    "dynamic_error",
+    "the free run refines it together with its initial state",
+)
+
 
 def zeroed(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> Log:
     """The log with its dynamic error relative to the relaxed spring.
 
     A mean twist needs a mean torque, and no gear twists by more than a degree. An offset that neither explains is due
     to the sensors, and is subtracted. A smaller one may be a load's as well, and is kept.
+
+    Where only the first outputs are known, they tell little of the zero without a model. If the other logs do not tell
+    it either, because they differ or theirs does not suit, the log has a zero of its own, which a free run estimates.
 
     Args:
         log: as read and masked.
@@ -36,6 +46,14 @@ def zeroed(log: Log, drive_file: DriveFile, *, zeros: Sequence[float] = ()) -> L
     """
     if log.dynamic_error is None:
         return log
+    found = _zeroed(log, drive_file, zeros)
+    others = {*zeros} or {0.0}
+    if log.outputs_until is None or others == {found.zero}:
+        return found
+    return replace(found, has_own_zero=True, findings=(*found.findings, _OWN_ZERO))
+
+
+def _zeroed(log: Log, drive_file: DriveFile, zeros: Sequence[float]) -> Log:
     likely = [zero for zero in (*zeros, 0.0) if _objection(log, zero, drive_file) is None]
     if likely:
         return _shifted(log, likely[0], "note", ", as from another log") if likely[0] else log

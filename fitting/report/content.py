@@ -176,6 +176,7 @@ def _logs(outcome: Outcome) -> list[dict[str, Any]]:
     for part, runs in outcome.after.parts().items():
         for run in runs:
             log = found.setdefault(run.name, {"name": run.name, "samples": 0} | dict.fromkeys(PARTS, 0))
+            log["zero"] = run.zero
             log[part] += int(run.time.size)
             log["samples"] += int(run.time.size)
             log["seconds"] = log.get("seconds", 0.0) + float(run.time[-1] - run.time[0])

@@ -89,7 +89,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
                 f"A tie: {other['name']} ({plain_family(other['family'])}) explains the selection data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
-    notes += _own_phases(report)
+    notes += _own_phases(report) + _own_zeros(report)
     if report["judged_on"] != "test":
         notes.append(
             "The logs are too short to reserve test data: no error on unused data is stated. Record longer logs, or "
@@ -181,6 +181,19 @@ def _own_phases(report: Mapping[str, Any]) -> list[str]:
     return [
         f"The periodic effect begins each log in another phase, for which the clock was shifted {told}. In other logs "
         "its phase is unknown: predictions use that of the logs with unchanged clocks."
+    ]
+
+
+def _own_zeros(report: Mapping[str, Any]) -> list[str]:
+    """A note where the logs' dynamic errors have different zeros."""
+    zeros = {log["name"]: log["zero"] for log in report["logs"]}
+    if len({*zeros.values()}) < 2:
+        return []
+    unit = report["units"]["dynamic_error"]
+    told = formatting.words([f"{formatting.quantity(zero, unit)} from {name}" for name, zero in zeros.items()])
+    return [
+        f"The zero of the dynamic error differs between the logs, as where sensors are zeroed anew: {told} was "
+        "subtracted. What all logs have in common, such as a constant load, may be a part of it."
     ]
 
 

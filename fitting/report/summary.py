@@ -62,7 +62,7 @@ def _decision(report: Mapping[str, Any]) -> str:
             if report["evidence"]["challenge"]["imperfect"]:
                 rest = f" {left.capitalize()}, which an inexact law of the effect may explain."
         elif report["unknown_remains"]:
-            rest = f" Something unknown is also missing: free runs along selection data {_free_runs(report)}."
+            rest = f" Something unknown is also missing: free runs {_free_runs(report)}."
         elif report["noise"]["torque"] is None and (after is None or after >= RULES.excess * noise):
             rest = " Over short segments only noise is left; free runs drift."
         several = bool(report["unknown"]) or len(families) > 1
@@ -81,7 +81,7 @@ def _decision(report: Mapping[str, Any]) -> str:
     if report["evidence"]["final"]["at_bounds"]:
         return f"{opening} A parameter of what was found has ended at a bound: its law does not fit."
     if report["evidence"]["final"]["surprise"] is not None:
-        return f"{opening} Short segments hardly show it: free runs along selection data {_free_runs(report)}."
+        return f"{opening} Short segments hardly show it: free runs {_free_runs(report)}."
     depends = f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)"
     if left["explained_share"] < _NO_SHARE:
         depends = "on none of the quantities that were examined"
@@ -171,11 +171,12 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
 
 def _free_runs(report: Mapping[str, Any]) -> str:
     _, unit, noise = principal(report)
-    after, beyond = report["after"]["rmse"]["selection"], report["free_runs_times_expected"]
-    if after is None:
+    rmse, beyond = report["after"]["rmse"], report["free_runs_times_expected"]
+    if None in (beyond, rmse["training"], rmse["selection"]):
         return "diverge"
-    times = formatting.number(beyond)
-    return f"err by {_against_noise(after, noise, unit)}, {times} times what noise and uncertainty allow"
+    times, most = formatting.number(beyond), max(rmse["training"], rmse["selection"])
+    size = _against_noise(most, noise, unit)
+    return f"along training or selection data err by up to {size}, {times} times what noise and uncertainty allow"
 
 
 def _count(number: int) -> str:

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float
 from fitting.estimation.engines import linearise, with_engine
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_run import FreeRun, fitted_starts, free_run, whole_simulations, window
+from fitting.estimation.free_run import FreeRun, free_run, whole_simulations
+from fitting.estimation.initial_states import initial_states, window
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.weighing import whitening
 from fitting.uncertainty.noise_model import spread_by_torque
@@ -93,15 +94,20 @@ def prediction_bands(
     substeps = fitted.substeps
     if runs is None:
         runs = free_run(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
-    starts = fitted_starts(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
+    setting = {"covariance": noise, "halo": halo, "substeps": substeps}
+    states, _ = initial_states(fitted.model, stretches, **setting, like=fitted)
     whole = whole_simulations(fitted.model, fitted.free, stretches, halo, substeps)
-    states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
     by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
     driven = np.zeros(by_parameter.shape[:2])
     if torque_noise > 0.0:
         driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
     samples = window(fitted.model, stretches)
     windows = [stretch.beginning(samples).weight for stretch in stretches]
+    if any(stretch.experiment.has_own_zero for stretch in stretches):
+        # The zero is estimated like a state, and acts on the dynamic error alone.
+        by_zero = np.zeros_like(by_state[..., :1])
+        by_zero[[s.experiment.has_own_zero for s in stretches], :, -1] = 1.0
+        by_state = np.concatenate((by_state, by_zero), axis=-1)
     return tuple(
         _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], noise, found.covariance, weight)
         for i, (run, n, weight) in enumerate(zip(runs, map(len, stretches), windows, strict=True))

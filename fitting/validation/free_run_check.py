@@ -32,34 +32,33 @@ def share_explained(
 
 def surprise(
     final: Fit,
-    runs: Sequence[FreeRun],
-    held_out: Fit,
+    runs: Sequence[FreeRun] | None,
+    short: Fit,
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int,
     torque_noise: float = 0.0,
 ) -> float | None:
-    """Rms error of free runs along held-out stretches, over the rms of their prediction bands. Bands contain the
-    residual of short segments, and the uncertainty of parameters and initial state.
+    """Rms error of free runs along whole stretches, over the rms of their prediction bands. Bands contain the residual
+    of short segments, and the uncertainty of parameters and initial state.
 
     Near one for a right model, also a chaotic one, whose bands grow like its errors. None where bands say nothing.
 
     Args:
         final: the model with its effects.
-        runs: its free runs along the held-out stretches.
-        held_out: the model on short segments of these stretches, whose residual contains all coloured noise.
+        runs: its free runs along the stretches; simulated if None.
+        short: the model on short segments of the stretches, whose residual contains all coloured noise.
         noise: covariance of the measurement noise, estimated from shorter pieces.
         halo: intervals of torque before a stretch.
         torque_noise: standard deviation of the noise of a torque sample [N m].
     """
-    short = _short_error(held_out, noise)
-    known = {"noise": short, "halo": halo, "runs": runs, "torque_noise": torque_noise}
-    return over_bands(prediction_bands(final, uncertainty(final), held_out.stretches, **known))
+    known = {"noise": _short_error(short, noise), "halo": halo, "runs": runs, "torque_noise": torque_noise}
+    return over_bands(prediction_bands(final, uncertainty(final), short.stretches, **known))
 
 
-def _short_error(held_out: Fit, noise: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
+def _short_error(short: Fit, noise: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
     """Covariance of the error over short segments; at least the measurement noise."""
-    return max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
+    return max(noise, short.covariance, key=lambda covariance: float(covariance[-1, -1]))
 
 
 def over_bands(bands: Sequence[PredictionBand]) -> float | None:

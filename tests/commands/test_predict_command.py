@@ -21,7 +21,7 @@ from command_files import (
 from invocation import run
 
 import rig
-from fitting.estimation.free_run import WINDOW
+from fitting.estimation.initial_states import WINDOW
 from hdjax.effects.thermal import ThermalStiffness
 
 pytestmark = pytest.mark.usefixtures("own_cache")

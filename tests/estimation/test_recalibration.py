@@ -9,7 +9,7 @@ import rig
 from fitting.estimation.base_fit import base_fit
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, whole
-from fitting.estimation.recalibration import recalibrated, remaining_offsets, with_zeros
+from fitting.estimation.recalibration import recalibrated, remaining_offsets, with_zeros, zeros_apart
 from fitting.logs.zeroing import counted_from
 from hdjax import Drive, TwoInertiaModel
 
@@ -48,6 +48,26 @@ def test_fit_refines_the_zero_of_each_group_of_logs():
 def test_zero_is_not_refined_beside_a_missing_effect():
     found = fitted(experiment(0, zero=0.3, left=LEFT, motor_friction=(0.03, 0.05)))
     assert remaining_offsets(found) == {} and recalibrated(found, {}) is None
+
+
+def test_zeros_that_differ_between_logs_are_found_where_nothing_else_is_missing():
+    offsets = {"log 0": 5e-5, "log 1": 2e-4}
+    logs = [experiment(i, zero=0.0, left=left) for i, left in enumerate(offsets.values())]
+    other = experiment(2, zero=0.0, left=-1e-4)
+    again = recalibrated(fitted(*logs), {"zero-order": logs}, {"zero-order": [logs[0], other]})
+    assert again is not None
+    noise = np.hypot(rig.LOAD_NOISE, rig.MOTOR_NOISE / rig.N) / np.sqrt(COUNT)
+    for one, offset in zip(again[0]["zero-order"], offsets.values(), strict=True):
+        assert one.zero == pytest.approx(offset, abs=5 * noise)
+    end, unknown = again[1]["zero-order"]
+    assert end.zero == again[0]["zero-order"][0].zero and not end.has_own_zero
+    assert unknown.zero == 0.0 and unknown.has_own_zero
+
+
+@pytest.mark.parametrize(("offsets", "friction"), [((1e-4, 1e-4), 0.0), ((5e-5, 2e-4), 0.03)])
+def test_zeros_are_left_where_they_are_equal_or_an_effect_is_missing(offsets: tuple[float, float], friction: float):
+    logs = [experiment(i, zero=0.0, left=one, motor_friction=(friction, 0.05)) for i, one in enumerate(offsets)]
+    assert zeros_apart(fitted(*logs)) == {}
 
 
 def test_only_the_dynamic_error_is_shifted():

@@ -76,6 +76,25 @@ def test_logs_of_one_drive_share_a_zero_where_it_explains_their_offset():
     assert moved.zero == pytest.approx(-0.2, abs=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("offset", "zeros", "own"),
+    [
+        (0.7, [], True),
+        (0.7, [0.7], False),
+        (0.7, [0.7, 0.7], False),
+        (0.7, [0.0], True),
+        (0.7, [0.7, 0.71], True),
+        (0.0, [0.7], True),
+        (0.0, [], False),
+        (0.0, [0.0], False),
+    ],
+)
+def test_first_samples_have_a_zero_of_their_own_where_other_logs_do_not_tell_it(offset, zeros, own):
+    log = with_offset(drive_log(), offset)
+    assert zeroed(replace(log, outputs_until=50), DRIVE, zeros=zeros).has_own_zero is own
+    assert not zeroed(log, DRIVE, zeros=zeros).has_own_zero
+
+
 def test_masked_samples_do_not_change_the_zero():
     log = with_offset(drive_log(), 0.7)
     spoilt = log.dynamic_error.copy()

@@ -173,7 +173,8 @@ def test_unexplained_error_of_free_runs_is_reported(loop: Loop):
 def test_free_runs_beyond_their_bands_are_reported_beside_an_effect(loop: Loop, beyond: float | None, remains: bool):
     found = report_dict(_with_surprise(loop, beyond))
     assert found["unknown_remains"] == remains
-    assert ("Something unknown is also missing: free runs along selection data err by" in found["summary"]) == remains
+    told = "Something unknown is also missing: free runs along training or selection data err by up to"
+    assert (told in found["summary"]) == remains
     assert (found["after"]["parameters"]["K"]["flag"] == "not covered") == remains
 
 
