@@ -16,9 +16,8 @@ from fitting.discrepancy.challenge import Challenge
 from fitting.discrepancy.learn import Unknown, learn_supported
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
-from fitting.estimation.one_side import held_at
-from fitting.estimation.whole_log_fit import follows, long_fit
-from fitting.one_side_check import better_side
+from fitting.estimation.whole_log_fit import long_fit
+from fitting.one_side_check import better_side, held_by_side
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
@@ -140,9 +139,8 @@ def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[F
     side = study.side_of(found.model) or better_side(found)
     if side is None:
         return found if found.was_held else long_fit(found), None
-    held = held_at(side.model, found, side.free.paths)
-    # What was learned in the mesh beside other values may not suit the side's.
-    return (long_fit(held), side) if follows(held) else (long_fit(found), None)
+    held = held_by_side(side, found)
+    return (long_fit(found), None) if held is None else (long_fit(held), side)
 
 
 def _final_evidence(

@@ -7,8 +7,9 @@ side's own equation does not, that equation determines K, alpha and B_sp without
 from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import with_priors
-from fitting.estimation.one_side import fits_of_sides, stiffness_error, with_known_priors
+from fitting.estimation.one_side import fits_of_sides, held_at, stiffness_error, with_known_priors
 from fitting.estimation.starting_values import sees_twist
+from fitting.estimation.whole_log_fit import follows
 from fitting.uncertainty.one_side import contradicts, leaves_only_noise
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import OneSideModel, TwoInertiaModel
@@ -41,6 +42,13 @@ def better_side(found: Fit) -> Fit | None:
     own = uncertainty(found).estimates["K"]
     agrees = told[0].ci95[0] <= own.value <= told[0].ci95[1]
     return None if agrees and own.std <= told[0].std else sides[0]
+
+
+def held_by_side(side: Fit, found: Fit) -> Fit | None:
+    """A fit with K, alpha and B_sp fixed at those of one side's equation; None where it then no longer follows the
+    logs, since what was learned in the mesh beside other values does not suit these."""
+    held = held_at(side.model, found, side.free.paths)
+    return held if follows(held) else None
 
 
 def source_of(side: Fit | None) -> str:

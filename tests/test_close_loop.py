@@ -208,11 +208,17 @@ def test_single_precision_is_refused():
         jax.config.update("jax_enable_x64", True)
 
 
-def test_effect_that_does_not_explain_free_runs_is_unexplained(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("drifting", ["training", "selection"])
+def test_effect_that_does_not_explain_free_runs_is_unexplained(drifting: str, monkeypatch: pytest.MonkeyPatch):
     """An effect found over short segments is reported where no term can be learned; the decision is `unexplained`."""
+
+    def seen(final, runs, short, **options) -> float:
+        part = "training" if runs is None else "selection"
+        return 1.4 if part == drifting else 1.0
+
     module = import_module("fitting.conclusion")
     monkeypatch.setattr(module, "share_explained", lambda *args: 0.5)
-    monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
+    monkeypatch.setattr(module, "surprise", seen)
     monkeypatch.setattr(module, "learn_supported", lambda *args, **options: None)
     loop = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION))
     assert [f.name for f in loop.findings] == ["coulomb_friction"]

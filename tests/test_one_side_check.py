@@ -16,7 +16,7 @@ from fitting.estimation.one_side import fits_of_sides, held_at
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon
 from fitting.estimation.whole_log_fit import long_fit, refitted_on_all
 from fitting.loop import close_loop
-from fitting.one_side_check import better_side, source_of
+from fitting.one_side_check import better_side, held_by_side, source_of
 from fitting.report.content import report_dict
 from fitting.uncertainty.standard_errors import uncertainty
 from fitting.validation.account import of_parameters
@@ -55,6 +55,16 @@ def wrong_law(joint: joints.Joint, *priors: Prior, stated: joints.Joint | None =
     horizon = short_horizon(model, stretches)
     paths = (*base_paths(model), "viscous_motor_friction.b")
     return fit(model, stretches, paths, Segmentation(horizon, segment_length(horizon)))
+
+
+def test_values_of_a_side_are_not_forced_upon_a_model_that_they_do_not_suit():
+    found = wrong_law(RUBBING["load equation"])
+    side = better_side(found)
+    assert side is not None
+    held = held_by_side(side, found)
+    assert held is not None and float(held.model.drive.K) == float(side.model.drive.K)
+    exploding = dataclasses.replace(side, model=side.model.replace({"B_sp": -100.0 * SMOOTH.B_sp}))
+    assert held_by_side(exploding, found) is None
 
 
 @pytest.mark.parametrize("source", RUBBING)
