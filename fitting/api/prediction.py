@@ -1,7 +1,7 @@
 """Free runs of identified models along logs, and comparison of models."""
 
 import html
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -149,12 +149,19 @@ def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
         InputError: A log does not suit a model.
         DataError: A log can't be used.
     """
-    logs = [data.ready(log) for log in (*data.logs, *data.test)]
     stored = {name: _stored(model)[0] for name, model in models.items()}
-    runs = {name: tuple(run for log in logs for run in _runs(one, name, data, log)[0]) for name, one in stored.items()}
+    runs = {name: tuple(_along_all(one, name, data)) for name, one in stored.items()}
     factors = {name: as_logged(one.model)[1][-1] for name, one in stored.items()}
     noise = {name: factors[name] * float(np.sqrt(np.asarray(one.noise)[-1, -1])) for name, one in stored.items()}
     return Comparison(runs, noise)
+
+
+def _along_all(stored: StoredModel, name: str, data: Data) -> Iterator[FreeRun]:
+    """Free runs along all logs, with the zero of those that the model was fitted to; where they differ, each with its
+    own."""
+    for raw in (*data.logs, *data.test):
+        log = replace(data.ready(raw, zeros=stored.zeros), has_own_zero=len({*stored.zeros}) > 1)
+        yield from _runs(stored, name, data, log)[0]
 
 
 def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:

@@ -81,6 +81,7 @@ def test_report_json_follows_the_schema(loop: Loop, tmp_path: Path):
         "held_out": 600,
         "seconds": pytest.approx(2997 * rig.STEP),
         "clock_put_back": 0.0,
+        "zero": 0.0,
     }
     assert found["hold"] == HOLD and found["dropped"] == [] and found["unexplained"] is None
 
