@@ -82,19 +82,23 @@ def refined_intervals(found: Fit) -> dict[str, float]:
     if seen is None:
         return {}
     step, covariance = step_to_constants(found, seen)
-    if np.all(np.abs(step) < _SEEN * np.sqrt(np.diag(covariance))):
+    if not np.any(np.abs(step) > _SEEN * np.sqrt(np.diag(covariance))):
         return {}
     return {log: float(np.exp(s)) for log, s in zip(seen.logs, step[-len(seen.logs) :], strict=True)}
 
 
 def step_to_constants(found: Fit, seen: LogColumns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Gauss-Newton step of a fit's parameters and of a constant of each log, and their covariance."""
+    """Gauss-Newton step of a fit's parameters and of a constant of each log, and their covariance; NaN where a
+    simulation diverges."""
     columns = np.concatenate([seen.parameters, seen.columns], axis=2)
     columns = columns.reshape(-1, columns.shape[2])
     precision, off = np.asarray(found.free.precision), np.asarray(found.free.off_prior(found.free.pack(found.model)))
     prior = np.diag(np.concatenate([precision**2, 1.0 / seen.std**2]))
-    information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
+    with np.errstate(all="ignore"):
+        information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
     slope[: precision.size] += precision * off
+    if not (np.isfinite(information).all() and np.isfinite(slope).all()):
+        return np.nan * slope, np.nan * information
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     covariance = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
     return -covariance @ slope, covariance
