@@ -137,10 +137,10 @@ def _fitted_to_the_end(found: Fit, seen: FinalEvidence, study: Study) -> tuple[F
     if max(seen.excess) < RULES.excess:
         return long_fit(found), None
     side = study.side_of(found.model) or better_side(found)
-    if side is None:
+    held = None if side is None else held_by_side(side, found)
+    if held is None:
         return found if found.was_held else long_fit(found), None
-    held = held_by_side(side, found)
-    return (long_fit(found), None) if held is None else (long_fit(held), side)
+    return long_fit(held), side
 
 
 def _final_evidence(

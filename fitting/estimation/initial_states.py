@@ -3,16 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.estimation.engines import linearise, residual_at
+from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation
-from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.residual import slopes_by_zero
 from hdjax import Model, TwoInertiaModel
 
 WINDOW = 50
@@ -99,7 +98,7 @@ def _at_rest_where_possible(model: Model, starts: Fit, own: Bool[np.ndarray, " l
     each lane's own zero, which is estimated together with its states."""
     found = linearise(starts.problem, starts.unknowns)
     residual, slopes = np.asarray(found.residual), np.asarray(found.by_state)
-    by_zero = slopes_by_zero(starts.problem, starts.unknowns) if own.any() else residual
+    by_zero = slopes_by_zero(starts.problem)
     rows = np.maximum(np.asarray(starts.problem.segments.weight).sum(1) * starts.covariance.shape[0], 1.0)
     rates = np.array([i for i, n in enumerate(model.motion_states) if n in ("omega_m", "omega_l", "v")])
     states, zeros = np.array(starts.unknowns.states)[: own.size], np.zeros(own.size)
@@ -120,11 +119,3 @@ def _at_rest_where_possible(model: Model, starts: Fit, own: Bool[np.ndarray, " l
         states[lane, rates] = 0.0 if rests else states[lane, rates]
         zeros[lane] = np.sum(step[states.shape[1] :])
     return jnp.asarray(states), zeros
-
-
-def slopes_by_zero(problem: Problem, unknowns: Unknowns) -> Float[np.ndarray, "segments rows"]:
-    """Derivative of the residual by what is subtracted from the dynamic error, the last output."""
-    measured = problem.segments.measured
-    units = [eqx.tree_at(lambda p: p.segments.measured, problem, measured.at[..., -1].add(by)) for by in (-1.0, 1.0)]
-    less, more = (np.asarray(residual_at(one, unknowns)[0]) for one in units)
-    return 0.5 * (less - more)

@@ -5,20 +5,20 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fitting.estimation.base_fit import leaves_white_noise
-from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, Start, fit, log_of, segments_by
 from fitting.estimation.experiment import Experiment
-from fitting.estimation.initial_states import slopes_by_zero
-from fitting.estimation.projection import FirstStates
-from fitting.estimation.sample_rate import LogColumns, refined_intervals, step_to_constants, with_intervals
+from fitting.estimation.log_constants import log_columns, step_to_constants
+from fitting.estimation.residual import slopes_by_zero
+from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from hdjax import Hold
 
 # Mean of the residual, in standard errors, below which a zero is not refined (assumed).
 _SEEN = 2.0
-# Least difference of two logs' zeros, in standard errors, and most fits until they are found (assumed).
+# Least difference of two logs' zeros, in standard errors: equal ones, which may be a load's, differ as much once in two
+# million pairs. Most fits until they are found (assumed).
 _APART, _PASSES = 5.0, 4
 
 Data = Mapping[Hold, Sequence[Experiment]]
@@ -55,12 +55,14 @@ def remaining_offsets(found: Fit) -> dict[float, float]:
 def zeros_apart(found: Fit) -> dict[str, float]:
     """What is left to subtract from the dynamic error of each log where the logs' zeros differ, and where white noise
     remains then; else none: what all logs have in common, or what remains, is for the search."""
-    logs = segments_by(found, log_of)
+    logs = dict.fromkeys(map(log_of, found.stretches), np.inf)
     if len(logs) < 2 or found.model.measured[-1] != "dynamic_error" or leaves_white_noise(found):
         return {}
     total, error = np.zeros(len(logs)), np.inf
     for _ in range(_PASSES):
-        step, covariance = step_to_constants(found, _zero_columns(found, logs))
+        no_gap = np.zeros(found.unknowns.states.shape)
+        seen = log_columns(found, logs, slopes_by_zero(found.problem), no_gap)
+        step, covariance = step_to_constants(found, seen)
         own = slice(-len(logs), None)
         total = total + step[own]
         if leaves_white_noise(found):
@@ -79,19 +81,6 @@ def _differ(zeros: Float[np.ndarray, " logs"], covariance: Float[np.ndarray, "lo
     """Whether a log's zero differs significantly from that of the first one."""
     variance = np.diag(covariance) + covariance[0, 0] - 2.0 * covariance[0]
     return bool(np.any(np.abs(zeros - zeros[0]) > _APART * np.sqrt(np.maximum(variance, 0.0))))
-
-
-def _zero_columns(found: Fit, logs: Mapping[str, Bool[np.ndarray, " segments"]]) -> LogColumns:
-    """Sensitivities of a fit to the zeros of its logs."""
-    problem = found.at_solution
-    seen = linearise(problem, found.unknowns)
-    states = FirstStates.of(seen, problem.segments.joined)
-    of_log = np.stack(list(logs.values()), axis=-1)
-    by_zero = slopes_by_zero(problem, found.unknowns)[:, :, None] * of_log[:, None]
-    no_gap = np.zeros((*np.shape(seen.gap), len(logs)))
-    columns = states.without(by_zero, no_gap)
-    unknown = np.full(len(logs), np.inf)
-    return LogColumns(tuple(logs), unknown, np.asarray(seen.residual), states.parameters_without(seen), columns)
 
 
 def with_own_zeros(data: Data, offsets: Mapping[str, float]) -> dict[Hold, tuple[Experiment, ...]]:

@@ -195,6 +195,13 @@ def residual(
     return rows, where(joined, gap, 0.0)
 
 
+def slopes_by_zero(problem: Problem) -> Float[np.ndarray, "segments rows"]:
+    """Derivative of the residual by what is subtracted from the dynamic error, the last output."""
+    by_sample = -np.asarray(problem.segments.weight)[:, :, None] * np.asarray(problem.whitening)[:, -1]
+    hidden = len(problem.model.state_names) - len(problem.model.motion_states)
+    return np.pad(by_sample.reshape(len(by_sample), -1), ((0, 0), (0, hidden)))
+
+
 def _needed(segments: Segments) -> Int[Array, ""]:
     """Number of sample intervals to simulate: up to the last valid sample of any segment; all where segments are
     joined."""

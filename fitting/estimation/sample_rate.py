@@ -11,12 +11,11 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import Fit, log_of, segments_by
+from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment
-from fitting.estimation.projection import FirstStates
+from fitting.estimation.log_constants import LogColumns, log_columns, step_to_constants
 from fitting.estimation.residual import Problem
 from hdjax import Hold, PiecewisePolynomial
 
@@ -26,32 +25,12 @@ _SEEN = 0.1
 _CHANGE = 1e-5
 
 
-class LogColumns(eqx.Module):
-    """Sensitivity of a fit's residual to a constant of each of several logs.
-
-    Attributes:
-        logs: the logs.
-        std: prior standard deviation of each log's constant.
-        residual: of the fit.
-        parameters: its derivative by the free vector, projected orthogonal to the initial states.
-        columns: its derivative by each log's constant, projected likewise.
-    """
-
-    logs: tuple[str, ...] = eqx.field(static=True)
-    std: Float[np.ndarray, " logs"]
-    residual: Float[np.ndarray, "segments rows"]
-    parameters: Float[np.ndarray, "segments rows parameters"]
-    columns: Float[np.ndarray, "segments rows logs"]
-
-
 def rate_columns(found: Fit) -> LogColumns | None:
     """Sensitivities of a fit to the logarithms of its logs' uncertain sample intervals; None where all are known."""
     open_logs = _open_logs([s.experiment for s in found.stretches])
     if not open_logs:
         return None
     problem = found.at_solution
-    seen = linearise(problem, found.unknowns)
-    states = FirstStates.of(seen, problem.segments.joined)
     longer, shorter = (
         linearise(_with_intervals(problem, factor), found.unknowns) for factor in (1.0 + _CHANGE, 1.0 - _CHANGE)
     )
@@ -59,17 +38,7 @@ def rate_columns(found: Fit) -> LogColumns | None:
         (np.asarray(a) - np.asarray(b)) / (2.0 * _CHANGE)
         for a, b in ((longer.residual, shorter.residual), (longer.gap, shorter.gap))
     )
-    own = segments_by(found, log_of)
-    of_log = np.stack([own[log] for log in open_logs], axis=-1)
-    # A gap is a segment's initial state minus the preceding segment's final state.
-    columns = states.without(change[:, :, None] * of_log[:, None], -gap[:, :, None] * of_log[:, None])
-    return LogColumns(
-        logs=tuple(open_logs),
-        std=np.array(list(open_logs.values())),
-        residual=np.asarray(seen.residual),
-        parameters=states.parameters_without(seen),
-        columns=columns,
-    )
+    return log_columns(found, open_logs, change, gap)
 
 
 def refined_intervals(found: Fit) -> dict[str, float]:
@@ -85,23 +54,6 @@ def refined_intervals(found: Fit) -> dict[str, float]:
     if not np.any(np.abs(step) > _SEEN * np.sqrt(np.diag(covariance))):
         return {}
     return {log: float(np.exp(s)) for log, s in zip(seen.logs, step[-len(seen.logs) :], strict=True)}
-
-
-def step_to_constants(found: Fit, seen: LogColumns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Gauss-Newton step of a fit's parameters and of a constant of each log, and their covariance; NaN where a
-    simulation diverges."""
-    columns = np.concatenate([seen.parameters, seen.columns], axis=2)
-    columns = columns.reshape(-1, columns.shape[2])
-    precision, off = np.asarray(found.free.precision), np.asarray(found.free.off_prior(found.free.pack(found.model)))
-    prior = np.diag(np.concatenate([precision**2, 1.0 / seen.std**2]))
-    with np.errstate(all="ignore"):
-        information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
-    slope[: precision.size] += precision * off
-    if not (np.isfinite(information).all() and np.isfinite(slope).all()):
-        return np.nan * slope, np.nan * information
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    covariance = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-    return -covariance @ slope, covariance
 
 
 def with_intervals(

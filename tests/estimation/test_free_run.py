@@ -111,7 +111,7 @@ def test_zero_of_a_log_is_estimated_with_its_initial_state(state: tuple[float, .
     shared = experiment_from_log(log, hold="zero-order", N=rig.N)
     own = experiment_from_log(dataclasses.replace(log, has_own_zero=True), hold="zero-order", N=rig.N)
     assert run(shared).rmse > 1e-3
-    # The window determines the zero less well than a state: the wider band of a prediction says so.
+    # The window determines the zero less well than the states alone.
     found = run(own)
     np.testing.assert_allclose(found.predicted, run(zeroed).predicted + 9e-3, rtol=0, atol=5 * X_NOISE)
     assert found.rmse < 2.0 * X_NOISE

@@ -1,6 +1,7 @@
 """Prediction bands, compared with free runs over draws of the parameters and of the noise in the window."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -41,12 +42,10 @@ def band(bands: tuple[PredictionBand, ...]) -> PredictionBand:
     return bands[0]
 
 
-def repeated(
-    fitted: Fit, covariance: np.ndarray, noise: float, draws: int, weight: np.ndarray | None = None
-) -> np.ndarray:
+def repeated(fitted: Fit, covariance: np.ndarray, noise: float, draws: int, **changes: Any) -> np.ndarray:
     """Standard deviation of free runs at each sample, over parameters of that covariance and noise in the window."""
     random = np.random.default_rng(3)
-    clean = dataclasses.replace(rig.reduced_experiment(COUNT, seed=5), weight=weight)
+    clean = dataclasses.replace(rig.reduced_experiment(COUNT, seed=5), **changes)
     centre = np.asarray(fitted.free.pack(fitted.model))
     # Windows without noise are given a small one, since a fit of the state ends a hundredth of it from its minimum.
     given = COVARIANCE if noise else 1e-4 * COVARIANCE
@@ -99,7 +98,17 @@ def test_band_of_a_slow_channel_equals_the_scatter_of_repeated_free_runs(fitted:
     weight = (np.arange(COUNT) % 5 == 0).astype(float)
     unseen = dataclasses.replace(rig.reduced_experiment(COUNT, noise=NOISE, seed=5), weight=weight)
     band, _ = prediction_bands(found, known, [Stretch(unseen, START, n) for n in STOPS], noise=COVARIANCE)
-    assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 50, weight), 50)
+    assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 50, weight=weight), 50)
+
+
+def test_band_of_a_log_with_a_zero_of_its_own_equals_the_scatter_of_repeated_free_runs(
+    fitted: tuple[Fit, Uncertainty], band: PredictionBand
+):
+    found, known = fitted
+    unseen = dataclasses.replace(rig.reduced_experiment(COUNT, noise=NOISE, seed=5), has_own_zero=True)
+    own, _ = prediction_bands(found, known, [Stretch(unseen, START, n) for n in STOPS], noise=COVARIANCE)
+    assert np.all(own.std_state[-100:] > band.std_state[-100:])
+    assert_same_spread(own.std_predicted, repeated(found, known.covariance, NOISE, 50, has_own_zero=True), 50)
 
 
 def test_bands_of_several_stretches_are_independent(bands: tuple[PredictionBand, ...]):
