@@ -16,16 +16,13 @@ from fitting.attribution.support import Standing, leaves_imperfection
 from fitting.errors import DataError
 from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.encoder_delay import delay_of_load
-from fitting.estimation.estimate import lost
+from fitting.estimation.estimate import mostly_lost
 from fitting.estimation.outliers import with_weights
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.uncertainty.one_side import leaves_only_noise, with_mesh_priors
 from hdjax import Hold, Model
 from hdjax.effects import Effect
-
-# Largest share of segments in which the base model may diverge.
-_MOST_LOST = 0.5
 
 
 class Search(eqx.Module):
@@ -75,7 +72,7 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Stud
     finer = study.fine_enough(chosen.training)
     if finer is not study:
         chosen = attempt(chosen.model, finer, chosen.hold, start=chosen, hold_parameters=is_held(best))
-    if np.mean(lost(chosen.training)) > _MOST_LOST:
+    if mostly_lost(chosen.training):
         raise DataError(
             "the simulated drive diverges for every stiffness and damping; check the inertias in the drive file, and "
             "unit, sign and side of the torque column"

@@ -8,7 +8,7 @@ own states.
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 
 from fitting.estimation.beside_friction import fits_of_starts, refitted_beside
 from fitting.estimation.encoder_delay import delay_of_load
-from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.estimate import Fit, Start, Strategy, fit, mostly_lost
 from fitting.estimation.experiment import Moved, Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.late_readings import moved_to
@@ -154,16 +154,17 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     if leaves_white_noise(best):
         return best, begun, None
     driven = one_side_fit(best.model, training) if isinstance(best.model, TwoInertiaModel) else None
-    if _contradicts(driven, best):
-        return _held_at(driven, best.model, training, halo), begun, driven
+    if (held := _held_by(driven, best, training, halo)) is not None:
+        return held, begun, driven
+    first = best
     trials = [(fitted(s, strategy=Strategy(_TRIAL_STEPS)), s) for s in starts[1:]]
     for trial, start in sorted(trials, key=lambda pair: pair[0].objective):
         if trial.objective < best.objective + _HOPELESS:
             other = fitted(trial.model)
             if other.objective < best.objective:
                 best, begun = other, start
-    if _contradicts(driven, best):
-        return _held_at(driven, best.model, training, halo), begun, driven
+    if best is not first and (held := _held_by(driven, best, training, halo)) is not None:
+        return held, begun, driven
     return best, begun, None
 
 
@@ -212,15 +213,18 @@ def _with_inertias_free(found: Fit, priors: tuple[Prior, ...]) -> Fit:
     return fitted(strategy=Strategy(hold_parameters=True)) if is_held(found) and not leaves_white_noise(free) else free
 
 
-def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
-    """Whether one side's own equation, which holds whatever acts on the other, contradicts a fit of the drive.
+def _held_by(driven: Fit | None, best: Fit, training: Sequence[Stretch], halo: int) -> Fit | None:
+    """The drive fixed at the values of one side's own equation, where this contradicts a fit of the drive; else None.
 
-    Large friction makes a side move far less than the base model predicts. In that model only the mesh can dissipate
-    the energy. So the fit raises B_sp until the twist vanishes and K has no influence.
+    The equation holds whatever acts on the other side. Large friction makes a side move far less than the base model
+    predicts. In that model only the mesh can dissipate the energy. So the fit raises B_sp until the twist vanishes and
+    K has no influence. But what the equation lacks itself (a flexible load) may make its own B_sp so negative that the
+    drive diverges.
     """
-    if driven is None:
-        return False
-    return held_at(best.model, driven).objective - driven.objective > -np.log(MOST_LEFT)
+    if driven is None or held_at(best.model, driven).objective - driven.objective <= -np.log(MOST_LEFT):
+        return None
+    held = _held_at(driven, best.model, training, halo)
+    return None if mostly_lost(held) else held
 
 
 def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:

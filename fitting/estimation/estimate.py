@@ -382,3 +382,8 @@ def followed_error(found: Fit) -> Float[np.ndarray, "segments samples outputs"]:
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     """The segments in which the simulation diverges."""
     return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))
+
+
+def mostly_lost(found: Fit) -> bool:
+    """Whether the simulation diverges in more than half of the segments, so that the fit means nothing."""
+    return bool(np.mean(lost(found)) > 0.5)

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import joints
+from fitting.estimation import base_fit as base_fit_module
 from fitting.estimation.base_fit import base_fit, is_held
-from fitting.estimation.estimate import Fit
+from fitting.estimation.estimate import Fit, mostly_lost
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.one_side import fit_of_side, fits_of_sides, held_at, one_side_fit, stiffness_error
@@ -198,3 +199,12 @@ def test_side_that_determines_stiffness_better_is_chosen(joint: joints.Joint):
     assert chosen is not None
     assert float(chosen.model.get("K")) == float(sides[int(np.argmin(errors))].model.get("K"))
     assert stiffness_error(chosen) == pytest.approx(min(errors), rel=0.5)
+
+
+def test_values_of_a_side_under_which_the_drive_diverges_are_not_taken(stretches, motor_driven_fit, monkeypatch):
+    """What the equation lacks itself, such as a flexible load, may make its damping negative."""
+    unstable = eqx.tree_at(lambda f: f.model, motor_driven_fit, motor_driven_fit.model.replace({"B_sp": -20.0}))
+    monkeypatch.setattr(base_fit_module, "one_side_fit", lambda *_: unstable)
+    found = base_fit(model_of(WITH_FRICTION), stretches).fit
+    assert not is_held(found)
+    assert not mostly_lost(found)
