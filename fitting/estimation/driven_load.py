@@ -9,7 +9,7 @@ linear in all other unknowns,
 
     N k_T T_m + G T_l = N^2 J_m q'' + J_l (G q)'' + friction of the motor      (momentum of the motor)
     tau + G T_l = J_l (G q)''                                                   (a sensor of the joint torque)
-    theta_l'' = (G q)''                                                         (a sensor of the load)
+    theta_l'' = (G q)'' + (1 - G) T_l / J_l                                     (a sensor of the load)
 
 so that only c_K and c_B are searched. Test functions replace derivatives as in
 [`fitting.estimation.starting_values`][]. Friction and inertia of the motor do not affect the antiresonance.
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.estimation.experiment import Experiment, Stretch
-from fitting.estimation.weak_form import WIDTHS, against, bump_functions
+from fitting.estimation.weak_form import WIDTHS, against, bump_functions, solved
 from hdjax import Drive, Model, TwoInertiaModel
 
 Signal = Float[np.ndarray, " samples"]
@@ -109,7 +109,7 @@ def friction_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) ->
 
 
 class _Part(NamedTuple):
-    """Inner products of one stretch's signals with test functions."""
+    """The signals of one stretch."""
 
     motor: Seen
     load: Seen | None
@@ -205,11 +205,9 @@ class _Balance:
             for equation in self._equations(part, of_motor, c_K, c_B)
         ]
         a, b = (np.concatenate(column) for column in zip(*(e.rows(self.wanted) for e in equations), strict=True))
-        norm = np.linalg.norm(a, axis=0)
-        norm[norm == 0] = 1.0
-        solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0]
-        share = float(np.sum((b - a / norm @ solution) ** 2)) / len(equations)
-        inertias, (direction, speed, _) = np.split(solution / norm, [len(self.wanted)])
+        solution = solved(a, b)
+        share = float(np.sum((b - a @ solution) ** 2)) / len(equations)
+        inertias, (direction, speed, _) = np.split(solution, [len(self.wanted)])
         if not (np.all(inertias > 0) and np.isfinite(share)):
             share = _NO_START
         return share, dict(zip(self.wanted, map(float, inertias), strict=True)), (float(direction), float(speed))
@@ -229,9 +227,12 @@ class _Balance:
         if part.joint is not None:
             joint = self._against(part.joint, part, 0)
             yield _Equation(load, [none] * 3, joint + on_load, joint, known)
-        if part.load is not None:
-            seen = self._against(part.load.values, part, 2 - part.load.order)
-            yield _Equation({"J_m": none, "J_l": none}, [none] * 3, seen - answer, seen, known)
+        # An unknown inertia would enter the load's answer to a torque of its own as 1/J_l.
+        if part.load is not None and (part.load_torque is None or "J_l" in known):
+            seen, pushed = self._against(part.load.values, part, 2 - part.load.order), none
+            if part.load_torque is not None:
+                pushed = (self._against(part.load_torque, part, 0) - on_load) / known["J_l"]
+            yield _Equation({"J_m": none, "J_l": none}, [none] * 3, seen - answer - pushed, seen, known)
 
     def solved(self) -> tuple[float, dict[str, float]]:
         """The unexplained share, and the values that minimise it."""

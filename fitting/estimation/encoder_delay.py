@@ -8,6 +8,7 @@ the load. A wrong delay leaves much of either unexplained: near the resonance th
 that nothing else shifts their phase alike.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -44,6 +45,7 @@ def delay_of_load(model: Model, stretches: Sequence[Stretch]) -> float:
     most = int(min(LONGEST_DELAY / step, _MOST_ROWS))
     parts = [_signals(stretch) for stretch in stretches]
 
+    @functools.cache
     def left(row: int, width: int, side: str = "load") -> float:
         return _unexplained(model, parts, width, row * step, most * step, side)
 

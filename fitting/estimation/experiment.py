@@ -1,5 +1,6 @@
 """Logs prepared for simulation: torque between samples, measured outputs, and stretches of them."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from math import comb
@@ -86,8 +87,12 @@ class Experiment(Record):
 
     def output(self, name: str) -> Float[np.ndarray, " n"] | None:
         """A measured output by its name; None where it was not measured."""
-        names = self.outputs or BOTH_ANGLES[-self.measured.shape[1] :]
-        return self.measured[:, names.index(name)] if name in names else None
+        return self.measured[:, self.names.index(name)] if name in self.names else None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the measured outputs; where none are given, of both angles or the dynamic error alone."""
+        return self.outputs or BOTH_ANGLES[-self.measured.shape[1] :]
 
     def less(self, offset: float) -> "Experiment":
         """The experiment with so much subtracted from its dynamic error, the last output."""
@@ -97,7 +102,7 @@ class Experiment(Record):
         measured[:, -1] -= offset
         return replace(self, measured=measured, zero=self.zero + offset)
 
-    @property
+    @functools.cached_property
     def time_step(self) -> float:
         """Median sampling interval [s]."""
         return float(np.median(np.diff(self.time)))

@@ -105,7 +105,8 @@ def free_run(
     like: Fit | None = None,
     judged: Sequence[Stretch] | None = None,
 ) -> tuple[FreeRun, ...]:
-    """Simulate each stretch from its first [`WINDOW`][] samples on.
+    """Simulate each stretch after its initial state is fitted to its first samples, see
+    [`fitting.estimation.initial_states.window`][].
 
     Args:
         model: the equations with their values.

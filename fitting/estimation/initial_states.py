@@ -17,7 +17,8 @@ from hdjax import Model, TwoInertiaModel
 WINDOW = 50
 """Samples of the initial-state window."""
 
-# Window where no sensor observes the twist: periods of the antiresonance, and largest share of a stretch, both assumed.
+# Window where the dynamic error was not measured: periods of the antiresonance, and largest share of a stretch, both
+# assumed.
 _PERIODS, _MOST = 1.0, 0.25
 
 # 99 % point of chi-squared with as many degrees of freedom as there are rates (one or two).
@@ -28,10 +29,11 @@ _PASSES = 3
 
 
 def window(model: Model, stretches: Sequence[Stretch]) -> int:
-    """Samples of the initial-state window: [`WINDOW`][], or more where no sensor observes the twist."""
+    """Samples of the initial-state window: [`WINDOW`][], or more where the dynamic error was not measured."""
     if not isinstance(model, TwoInertiaModel) or "dynamic_error" in model.measured:
         return WINDOW
-    period = 2 * np.pi * np.sqrt(float(model.drive.J_l / model.drive.K)) / stretches[0].experiment.time_step
+    fastest = min(stretch.experiment.time_step for stretch in stretches)
+    period = 2 * np.pi * np.sqrt(float(model.drive.J_l / model.drive.K)) / fastest
     return int(np.clip(_PERIODS * period, WINDOW, max(WINDOW, _MOST * min(len(s) for s in stretches))))
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from fitting.estimation.experiment import Experiment, Moved, Stretch
 from hdjax import Model
-from hdjax.dynamics import BOTH_ANGLES, JOINT_TORQUE
+from hdjax.dynamics import JOINT_TORQUE
 from hdjax.effects import Effect
 from hdjax.effects.sensing import SensorDelay
 from hdjax.parameters import as_scalar, own_parameters
@@ -83,7 +83,7 @@ def moved_to(experiment: Experiment, by: Moved) -> Experiment:
     time, further = experiment.time, Moved(*(new - old for new, old in zip(by, experiment.moved, strict=True)))
     if further == Moved():
         return experiment
-    names = experiment.outputs or BOTH_ANGLES
+    names = experiment.names
     measured = moved_readings(time, experiment.measured, names, further)
     weight = np.ones(time.size) if experiment.weight is None else experiment.weight
     for late in set(_times(names, further).values()):

@@ -61,7 +61,8 @@ def _data(problem: Problem, kernel: Kernel, free: Any, slopes: Any, states: Any,
     whole = library.any(library.asarray(segments.joined))
     numbers = [library.asarray(problem.substeps), whole, threads()]
     named = {"load torque": segments.load_torque, "temperature": segments.temperature}
-    beside = [named[name] for name in kernel.signals]
+    beside = [signal for name in kernel.signals if (signal := named[name]) is not None]
+    assert len(beside) == len(kernel.signals)
     return Lanes(
         free=free,
         slopes=slopes,
@@ -73,7 +74,7 @@ def _data(problem: Problem, kernel: Kernel, free: Any, slopes: Any, states: Any,
         joined=library.asarray(segments.joined, dtype=float),
         whitening=problem.whitening,
         settings=library.stack([library.asarray(n, dtype=np.int64) for n in numbers]),
-        signals=(segments.torque.coefficients, *(s.coefficients for s in beside if s is not None)),
+        signals=(segments.torque.coefficients, *(s.coefficients for s in beside)),
     )
 
 

@@ -22,9 +22,28 @@ def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndar
         model: supplies the drive and the outputs.
         segments: the data.
     """
+    load = segments.load_torque
+    data = [segments.measured, segments.weight, segments.torque.coefficients[:, segments.halo :]]
+    data = [np.asarray(a) for a in (*data, *([] if load is None else [load.coefficients]))]
+    steps = np.median(segments.width, axis=1)
+    # Logs may have different sample rates.
+    rates = np.round(100.0 * np.log(steps))
+    states = np.zeros((len(steps), 4))
+    for own in (rates == rate for rate in np.unique(rates)):
+        states[own] = _at_one_rate(model, float(np.median(steps[own])), *(a[own] for a in data))
+    return states
+
+
+def _at_one_rate(
+    model: TwoInertiaModel,
+    step: float,
+    measured: Float[np.ndarray, "segments samples outputs"],
+    weight: Float[np.ndarray, "segments samples"],
+    torque: Float[np.ndarray, "segments intervals powers"],
+    load: Float[np.ndarray, "segments intervals powers"] | None = None,
+) -> Float[np.ndarray, "segments 4"]:
+    """[`observed_states`][] of segments with the same sample interval."""
     drive, N = model.drive, float(model.drive.N)
-    measured, weight = np.array(segments.measured), np.asarray(segments.weight)
-    step = float(np.median(segments.width))
     slowest = float(np.sqrt(drive.K / drive.J_l))
     samples = int(np.clip(np.ceil(2 * np.pi * _PERIODS / slowest / step), 8, _MOST_SAMPLES))
     samples = min(samples, weight.shape[1])
@@ -37,8 +56,6 @@ def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndar
     across, pushes = over_a_step(drive, step)
     reads = readings(model)
     powers, forced = [np.eye(4)], np.zeros((len(measured), samples, 4))
-    torque = np.asarray(segments.torque.coefficients)[:, segments.halo :]
-    load = None if segments.load_torque is None else np.asarray(segments.load_torque.coefficients)
     for i in range(samples - 1):
         powers.append(across @ powers[-1])
         forced[:, i + 1] = forced[:, i] @ across.T + _pushed(torque[:, i], pushes[:, :2])

@@ -216,6 +216,8 @@ def stable_substeps(model: Model, time_step: float) -> int:
 
 
 def short_horizon(model: Model, stretches: Sequence[Stretch]) -> int:
-    """Samples in a segment of about six natural periods, as a power of two (few shapes, few programs)."""
-    period = 2 * np.pi / natural_frequency(model, stretches) / stretches[0].experiment.time_step
+    """Samples in a segment of about six natural periods at the lowest sample rate, as a power of two (few shapes, few
+    programs)."""
+    slowest = max(stretch.experiment.time_step for stretch in stretches)
+    period = 2 * np.pi / natural_frequency(model, stretches) / slowest
     return int(2 ** np.clip(np.round(np.log2(_PERIODS * period)), 5, 11))

@@ -12,7 +12,7 @@ from fitting.estimation.residual import Blocks
 from fitting.estimation.segments import Segments
 from fitting.record import Record
 
-# Numbers whose square overflows.
+# Sums of squares below this count as zero.
 _NOTHING = 1e-200
 
 

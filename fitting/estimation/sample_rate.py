@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.estimation.engines import linearise
+from fitting.estimation.engines import residual_at
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment
 from fitting.estimation.log_constants import LogColumns, log_columns, step_to_constants
@@ -32,12 +32,9 @@ def rate_columns(found: Fit) -> LogColumns | None:
         return None
     problem = found.at_solution
     longer, shorter = (
-        linearise(_with_intervals(problem, factor), found.unknowns) for factor in (1.0 + _CHANGE, 1.0 - _CHANGE)
+        residual_at(_with_intervals(problem, factor), found.unknowns) for factor in (1.0 + _CHANGE, 1.0 - _CHANGE)
     )
-    change, gap = (
-        (np.asarray(a) - np.asarray(b)) / (2.0 * _CHANGE)
-        for a, b in ((longer.residual, shorter.residual), (longer.gap, shorter.gap))
-    )
+    change, gap = ((np.asarray(a) - np.asarray(b)) / (2.0 * _CHANGE) for a, b in zip(longer, shorter, strict=True))
     return log_columns(found, open_logs, change, gap)
 
 

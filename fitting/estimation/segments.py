@@ -74,9 +74,10 @@ def cut(
         count: number of segments, the superfluous ones with weight zero; [`segment_count`][] where not given.
     """
     pieces = 1 if horizon is None else max(1, -(-horizon // length))
-    loaded = any(s.experiment.load_torque is not None for s in stretches)
+    loads = [s.experiment.load_torque for s in stretches]
+    powers = max((np.shape(load.coefficients)[1] for load in loads if load is not None), default=0)
     warm = all(s.experiment.temperature is not None for s in stretches)
-    parts = [_cut_one(s, length, pieces, halo, loaded=loaded, warm=warm) for s in stretches]
+    parts = [_cut_one(s, length, pieces, halo, powers=powers, warm=warm) for s in stretches]
     found = [np.concatenate(column) for column in zip(*parts, strict=True)]
     goes_on = np.concatenate([_goes_on(*pair, length) for pair in zip((None, *stretches), stretches, strict=False)])
     missing = max(0, (segment_count(stretches, length) if count is None else count) - found[0].shape[0])
@@ -87,7 +88,7 @@ def cut(
     own_knots = jnp.asarray(knots)
     return Segments(
         torque=PiecewisePolynomial(own_knots, jnp.asarray(torque)),
-        load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if loaded else None,
+        load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if powers else None,
         measured=jnp.asarray(measured),
         weight=jnp.asarray(weight),
         goes_on=jnp.asarray(np.append(goes_on, np.zeros(missing, dtype=bool))),
@@ -107,7 +108,7 @@ def _goes_on(before: Stretch | None, stretch: Stretch, length: int) -> Bool[np.n
 
 
 def _cut_one(
-    stretch: Stretch, length: int, pieces: int, halo: int, *, loaded: bool, warm: bool
+    stretch: Stretch, length: int, pieces: int, halo: int, *, powers: int, warm: bool
 ) -> tuple[np.ndarray, ...]:
     """Arrays of one stretch's segments, by row: knots, torque, load torque (zero where only other logs have one),
     temperature, measured outputs, weight, whether joined."""
@@ -124,7 +125,8 @@ def _cut_one(
     knots = np.asarray(experiment.torque.knots)[known] + (outer - known) * experiment.time_step
     own = index[:, halo:]
     load, warmth = experiment.load_torque, experiment.temperature
-    on_load = np.zeros((last + 1, torque.shape[-1] if loaded else 0)) if load is None else np.asarray(load.coefficients)
+    on_load = np.zeros((last + 1, 0)) if load is None else np.asarray(load.coefficients)
+    on_load = np.pad(on_load, ((0, 0), (0, powers - on_load.shape[1])))
     # Linear interpolation needs no higher powers.
     line = np.asarray(warmth.coefficients)[:, :2] if warm and warmth is not None else np.zeros((last + 1, 0))
     own_row = np.clip(own, 0, last)

@@ -25,7 +25,7 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     problem, substeps = found.at_solution, found.substeps
     slopes = linearise(problem, found.unknowns) if np.isfinite(shift) else None
     count = np.sum(np.asarray(problem.segments.weight))
-    rows, gap = residual_at(problem, found.unknowns)
+    rows, gap = residual_at(problem, found.unknowns) if slopes is None else (slopes.residual, slopes.gap)
     while substeps < most:
         finer, finer_gap = residual_at(replace(problem, substeps=2 * substeps), found.unknowns)
         change, gap_change = np.asarray(finer) - np.asarray(rows), np.asarray(finer_gap) - np.asarray(gap)

@@ -19,7 +19,7 @@ from fitting.errors import DataError
 from fitting.estimation import weak_form
 from fitting.estimation.driven_load import starts_from_motor
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.weak_form import WIDTHS, blind_functions, bump_functions
+from fitting.estimation.weak_form import WIDTHS, blind_functions, bump_functions, solved
 from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 
 # Starts whose log stiffness differs by less than this end in the same minimum.
@@ -169,11 +169,9 @@ def _momentum(
     if not parts:
         return None
     matrix, right = (np.concatenate(column) for column in zip(*parts, strict=True))
-    norm = np.linalg.norm(matrix, axis=0)
-    norm[norm == 0] = 1.0
-    solution = np.linalg.lstsq(matrix / norm, right, rcond=1e-10)[0]
-    missed = float(np.sum((right - matrix / norm @ solution) ** 2) / np.sum(right**2))
-    return missed, tuple(map(float, (solution / norm)[: len(wanted)]))
+    solution = solved(matrix, right)
+    missed = float(np.sum((right - matrix @ solution) ** 2) / np.sum(right**2))
+    return missed, tuple(map(float, solution[: len(wanted)]))
 
 
 def _estimates(
@@ -229,9 +227,7 @@ def _solved(
     if not parts:
         return None
     a, b = (np.concatenate(column) for column in zip(*parts, strict=True))
-    norm = np.linalg.norm(a, axis=0)
-    norm[norm == 0] = 1.0
-    solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0] / norm
+    solution = solved(a, b)
     return solution, float(np.linalg.norm(b - a @ solution) / max(np.linalg.norm(b), 1e-300))
 
 

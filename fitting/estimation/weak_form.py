@@ -20,6 +20,15 @@ def against(
     return (windows @ functions.T).ravel()
 
 
+def solved(
+    columns: Float[np.ndarray, "rows columns"], right: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " columns"]:
+    """Least-squares solution, independent of the columns' units; zero for columns of zeros."""
+    norm = np.linalg.norm(columns, axis=0)
+    norm[norm == 0] = 1.0
+    return np.linalg.lstsq(columns / norm, right, rcond=1e-10)[0] / norm
+
+
 @functools.lru_cache(maxsize=32)
 def bump_functions(width: int, dt: float) -> TestFunctions:
     """A bump (1 - s^2)^4 and its modulations, with first and second derivatives, sampled on the window."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.estimation.engines import linearise, simulate
+from fitting.estimation.engines import residual_at, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit, half_log_determinant
 from fitting.estimation.free_parameters import as_they_are
 from fitting.estimation.free_run import whole_simulations
@@ -14,7 +14,7 @@ from fitting.estimation.residual import Unknowns
 from fitting.estimation.solver_steps import needed_substeps
 
 _STEPS = 20
-# Damping for a start near the solution.
+# Settings for a start near the solution.
 _CONTINUED = Strategy(_STEPS, begin_anew_above=np.inf, retry_states=False)
 # Largest parameter shift by solver error, in standard errors; largest number of solver steps per sample during and at
 # the end of the fit. Dry friction that determines K to 1e-7 needs 128 (`docs/uncertainty.md`).
@@ -134,7 +134,7 @@ def follows(found: Fit, *, share: float = 0.5) -> bool:
 def with_gaps_closed(found: Fit) -> float:
     """Approximate objective with all gaps between joined segments closed. Large gaps mean that the model does not
     follow the log over this horizon."""
-    gap = np.asarray(linearise(found.problem, found.unknowns).gap) * np.asarray(found.problem.gap_weight)
+    gap = np.asarray(residual_at(found.problem, found.unknowns)[1]) * np.asarray(found.problem.gap_weight)
     return found.objective + 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.linear_response import Followed, follow
-from fitting.estimation.problem import initial_states
 from fitting.estimation.scales import largest_torque
 from fitting.estimation.steady_torque import SteadyLoad, SteadyMotorTorque
 from hdjax import TwoInertiaModel
@@ -44,9 +43,8 @@ def _held(found: Fit, horizon: int) -> Fit:
     if isinstance(model, TwoInertiaModel):
         reach = largest_torque(found.stretches)
         model = model.with_effects(SteadyMotorTorque(reach=reach), SteadyLoad(reach=float(model.drive.N) * reach))
-    start = Start(found.covariance, initial_states(model, segmentation.of(found.stretches)))
     strategy = Strategy(hold_parameters=True, retry_states=False)
-    return fit(model, found.stretches, found.free.paths, segmentation, start=start, strategy=strategy)
+    return fit(model, found.stretches, found.free.paths, segmentation, start=Start(found.covariance), strategy=strategy)
 
 
 def _criterion(found: Fit) -> float:

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from fitting.estimation.engines import linearise
+from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import named
 from fitting.estimation.projection import FirstStates
@@ -103,10 +103,10 @@ def _products(fit: Fit, held: tuple[str, ...]) -> Float[np.ndarray, "all all"]:
     for path in held:
         value = float(fit.model.get(path))
         up, down = (
-            linearise(_with_held(problem, path, value * (1.0 + sign * _STEP)), fit.unknowns) for sign in (1, -1)
+            residual_at(_with_held(problem, path, value * (1.0 + sign * _STEP)), fit.unknowns) for sign in (1, -1)
         )
-        rows.append((up.residual - down.residual) / (2 * _STEP))
-        gaps.append((up.gap - down.gap) / (2 * _STEP))
+        row, gap = ((np.asarray(a) - np.asarray(b)) / (2 * _STEP) for a, b in zip(up, down, strict=True))
+        rows, gaps = [*rows, row], [*gaps, gap]
     states = FirstStates.of(found, problem.segments.joined)
     columns, before = np.stack(rows, axis=-1), -np.stack(gaps, axis=-1)
     both = np.concatenate([states.parameters_without(found), states.without(columns, before)], axis=2)

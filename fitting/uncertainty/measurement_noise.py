@@ -1,11 +1,13 @@
 """Measurement noise of the outputs, independent of model discrepancy."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.estimation.engines import linearise
+from fitting.estimation.engines import linearise, with_engine
 from fitting.estimation.estimate import REWEIGHTINGS, Fit, zeros_like
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
@@ -127,7 +129,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         head = head * (np.sum(head, axis=1, keepdims=True) >= np.floor(piece / every))
         if not head.any():
             continue
-        part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
+        # The logs that are left may lack a torque on the load.
+        part = with_engine(replace(held, segments=replace(segments, weight=jnp.asarray(head))))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         part, unknowns = on_all_devices(part, unknowns)
         covariance, before = found.covariance, np.full(len(found.covariance), np.inf)

@@ -27,11 +27,11 @@ class PredictionBand(eqx.Module):
 
     Attributes:
         run: the free run.
-        std_parameters: of the predicted dynamic error, due to the parameters' covariance [rad]. The initial state is
-            refitted to its window for each parameter value.
-        std_state: due to the noise in that window [rad].
-        std_noise: of the measured dynamic error [rad].
-        std_torque: of the predicted one, due to torque noise [rad].
+        std_parameters: of the predicted principal output, due to the parameters' covariance, in its unit. The initial
+            state is refitted to its window for each parameter value.
+        std_state: due to the noise in that window.
+        std_noise: of the measured one.
+        std_torque: of the predicted one, due to torque noise.
     """
 
     run: FreeRun
@@ -42,12 +42,12 @@ class PredictionBand(eqx.Module):
 
     @property
     def std_predicted(self) -> Float[np.ndarray, " n"]:
-        """Standard error of the predicted dynamic error [rad]."""
+        """Standard error of the predicted output."""
         return np.sqrt(self.std_parameters**2 + self.std_state**2 + self.std_torque**2)
 
     @property
     def std_measured(self) -> Float[np.ndarray, " n"]:
-        """Standard deviation of measured minus predicted [rad]."""
+        """Standard deviation of measured minus predicted."""
         return np.hypot(self.std_predicted, self.std_noise)
 
     @property

@@ -115,7 +115,8 @@ def linearised(fit: Fit) -> Linearised:
     samples = problem.segments.measured.shape[1] * problem.segments.measured.shape[2]
     prior = projected[:, samples:]
     known = np.diag(np.asarray(problem.free.precision) ** 2)
-    period = 2 * np.pi / natural_frequency(fit.model, fit.stretches) / fit.stretches[0].experiment.time_step
+    fastest = min(stretch.experiment.time_step for stretch in fit.stretches)
+    period = 2 * np.pi / natural_frequency(fit.model, fit.stretches) / fastest
     total = sum(len(s) for s in fit.stretches)
     return Linearised(
         records=_records(fit, residual, projected, states.by_first),

@@ -122,10 +122,13 @@ def uncertainty(fit: Fit, *, torque_noise: bool = True) -> Uncertainty:
     if not free.paths:
         empty = np.zeros((0, 0))
         return Uncertainty({}, empty, empty, empty)
-    regression = linearised(fit)
-    found = _beside_further(fit, regression)
-    if torque_noise:
-        found = _described(found, torque_noise_covariance(fit, regression, found.unit))
+    regression = _beside_further(fit, linearised(fit))
+    found, own = covariance(regression), len(free.paths)
+    other = torque_noise_covariance(fit, regression, found.unit) if torque_noise else None
+    robust, classical, unit = (matrix[:own, :own] for matrix in (found.robust, found.classical, found.unit))
+    found = Covariance(robust, classical, unit, found.degrees_of_freedom[:own])
+    if other is not None:
+        found = _described(found, other[:own, :own])
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
     estimates = {
@@ -136,8 +139,8 @@ def uncertainty(fit: Fit, *, torque_noise: bool = True) -> Uncertainty:
     return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
 
 
-def _beside_further(fit: Fit, regression: Linearised) -> Covariance:
-    """The covariance of the free vector, including uncertain sample rates and strengths of shaft torques."""
+def _beside_further(fit: Fit, regression: Linearised) -> Linearised:
+    """The regression with uncertain sample rates and strengths of shaft torques appended to the free vector."""
     columns, prior = [], []
     rates, torques = rate_columns(fit), torque_columns(fit)
     if rates is not None:
@@ -145,18 +148,12 @@ def _beside_further(fit: Fit, regression: Linearised) -> Covariance:
     if torques.size:
         columns, prior = [*columns, torques], [*prior, np.zeros(torques.shape[2])]
     if not columns:
-        return covariance(regression)
-    own = regression.information.shape[0]
-    further = np.concatenate(columns, axis=2), np.concatenate(prior)
-    wide = covariance(with_further(fit, regression, *further))
-    robust, classical, unit = (matrix[:own, :own] for matrix in (wide.robust, wide.classical, wide.unit))
-    return Covariance(robust, classical, unit, wide.degrees_of_freedom[:own])
+        return regression
+    return with_further(fit, regression, np.concatenate(columns, axis=2), np.concatenate(prior))
 
 
-def _described(found: Covariance, other: Float[np.ndarray, "parameters parameters"] | None) -> Covariance:
+def _described(found: Covariance, other: Float[np.ndarray, "parameters parameters"]) -> Covariance:
     """The covariance with larger variances where the torque noise model gives longer intervals."""
-    if other is None:
-        return found
     reach = stdtrit(found.degrees_of_freedom, 0.975) * np.sqrt(np.diag(found.robust))
     # Where only a prior gives information, rounding may make the data's part negative.
     variance = np.maximum(np.diag(other), 0.0)

@@ -185,6 +185,14 @@ def test_torques_of_a_shaft_add_to_a_logged_torque():
     assert float(fits[LoadDrivenModel].model.get("K")) == pytest.approx(WITH_FRICTION.K, rel=0.05)
 
 
+def test_logs_with_and_without_a_load_torque_are_fitted_together():
+    pushed = np.zeros(len(log_of(WITH_FRICTION).time))
+    logs = stretches_of(WITH_FRICTION), stretches_of(WITH_FRICTION, load_torque=pushed)
+    alone, both = (fit_of_side(MotorDrivenModel, model_of(WITH_FRICTION), some) for some in (logs[0], sum(logs, ())))
+    assert alone is not None and both is not None
+    assert float(both.model.get("K")) == pytest.approx(float(alone.model.get("K")), rel=1e-6)
+
+
 @pytest.mark.parametrize("side", ["load", "motor"])
 def test_no_torque_is_added_where_an_equation_holds_alone(side):
     assert start_beside_torques(side, model_of(SMOOTH), stretches_of(SMOOTH)) is None

@@ -1,5 +1,6 @@
 """Starting values, initial states, fits and reports of logs with any subset of the outputs."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -11,9 +12,9 @@ from hypothesis import strategies as st
 import joints
 from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.beside_friction import fits_of_starts
-from fitting.estimation.driven_load import friction_from_motor, through_load, twist
+from fitting.estimation.driven_load import friction_from_motor, starts_from_motor, through_load, twist
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
-from fitting.estimation.linear_drive import readings
+from fitting.estimation.linear_drive import over_a_step, readings
 from fitting.estimation.linear_response import readout
 from fitting.estimation.observed_states import observed_states
 from fitting.estimation.problem import Segmentation
@@ -133,6 +134,42 @@ def test_observed_initial_states_equal_the_true_motion(sensors: tuple[str, ...])
     x, v = (states[:, i] / JOINT.N - states[:, i + 1] for states in (motion,) for i in (0, 2))
     assert np.max(np.abs(found[: len(x), 0] / JOINT.N - found[: len(x), 1] - x)) < 1e-3 * np.max(np.abs(x))
     assert np.max(np.abs(found[: len(x), 2] / JOINT.N - found[: len(x), 3] - v)) < 1e-3 * np.max(np.abs(v))
+
+
+def test_observed_initial_states_of_logs_with_different_sample_rates_are_those_of_each():
+    sensors = ("motor_velocity", "load_velocity")
+    (fast,) = stretches_of(JOINT, sensors, noise=0.0)
+    experiment, segmentation, model = fast.experiment, Segmentation(128), true_model(sensors)
+    # The same samples read as those of a log that took three times as long.
+    slow = dataclasses.replace(
+        fast,
+        experiment=dataclasses.replace(
+            experiment,
+            time=3.0 * experiment.time,
+            torque=dataclasses.replace(experiment.torque, knots=3.0 * experiment.torque.knots),
+        ),
+    )
+    alone = [observed_states(model, segmentation.of([s])) for s in (fast, slow)]
+    together = observed_states(model, segmentation.of([fast, slow]))
+    whole_ones = COUNT // 128
+    for found, own in zip((together[:whole_ones], together[-(-COUNT // 128) :][:whole_ones]), alone, strict=True):
+        np.testing.assert_allclose(found, own[:whole_ones], rtol=0.05, atol=1e-3 * np.abs(own).max())
+
+
+def test_starting_values_of_both_velocities_hold_where_the_load_is_pushed():
+    """The load's answer to a torque of its own is not that to the motor's motion."""
+    step, drive = joints.STEP, true_model(("motor_angle",)).drive
+    pushed = 20.0 * JOINT.N * joints.torque_of(JOINT, count=COUNT, seed=3)
+    torque = joints.torque_of(JOINT, count=COUNT)
+    across, pushes = over_a_step(drive, step)
+    states = np.zeros((COUNT, 4))
+    for i in range(COUNT - 1):
+        states[i + 1] = across @ states[i] + pushes[:, 0] * torque[i] + pushes[:, 2] * pushed[i]
+    log = joints.log_of_sensors(JOINT, ("motor_velocity", "load_velocity"), count=COUNT)
+    log = dataclasses.replace(log, motor_velocity=states[:, 2], load_velocity=states[:, 3], load_torque=pushed)
+    stretches = whole([experiment_from_log(log, hold="zero-order", N=JOINT.N)])
+    starts = starts_from_motor(model_of(stretches), stretches)
+    assert starts and all(start["K"] == pytest.approx(JOINT.K, rel=0.1) for start in starts)
 
 
 @pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)

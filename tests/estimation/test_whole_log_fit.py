@@ -9,6 +9,7 @@ import pytest
 import rig
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.whole_log_fit import long_fit, without_gaps
 from fitting.uncertainty.standard_errors import uncertainty
@@ -59,3 +60,22 @@ def test_errors_without_gaps_are_those_of_one_simulation():
     gapless = without_gaps(short)
     assert gapless.objective > short.objective + 1.0
     np.testing.assert_allclose(np.asarray(gapless.covariance), np.asarray(alone.covariance), rtol=1e-6)
+
+
+def test_free_parameters_that_do_not_move_are_not_held():
+    """A fit that starts at its solution ends there; selection data must still move its parameters."""
+    experiment, model = rig.reduced_experiment(1024, noise=1e-3), rig.reduced_model()
+    stretches, segmentation = [Stretch(experiment, 0, 1024)], Segmentation(1024, 128, substeps=2)
+    first = fit(model, stretches, base_paths(model), segmentation)
+    again = fit(
+        first.model,
+        stretches,
+        base_paths(model),
+        segmentation,
+        start=Start(first.covariance, first.unknowns.states),
+        strategy=Strategy(reweigh=False),
+    )
+    assert float(again.model.get("omega_0")) == pytest.approx(float(first.model.get("omega_0")), rel=1e-9)
+    assert not again.was_held and not again.with_all_free().was_held
+    held = fit(first.model, stretches, base_paths(model), segmentation, strategy=Strategy(hold_parameters=True))
+    assert held.was_held and held.with_all_free().was_held

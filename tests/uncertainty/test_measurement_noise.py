@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import joints
 import rig
 from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
 from fitting.uncertainty.measurement_noise import _MOTION, measurement_noise
+from hdjax import Drive, TwoInertiaModel
 
 COUNT = 1000
 NOISE = 1e-3
@@ -56,6 +58,19 @@ def test_measurement_noise_of_a_short_log_with_gaps_is_finite():
     model, stretches = rig.reduced_model(), [Stretch(replace(experiment, weight=weight), 0, 200)]
     held = fit(model, stretches, base_paths(model), Segmentation(256), strategy=Strategy(hold_parameters=True))
     assert rms(held) == pytest.approx(NOISE, rel=0.3)
+
+
+def test_measurement_noise_is_estimated_where_only_a_short_log_has_a_load_torque():
+    """Pieces further on are cut from the other log alone, which has none."""
+    joint = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05)
+    logs = [joints.log_of(joint, count=2000), joints.log_of(joint, count=180, seed=1, name="short")]
+    logs[1] = replace(logs[1], load_torque=np.zeros(180))
+    stretches = whole([experiment_from_log(log, hold="zero-order", N=joint.N) for log in logs])
+    drive = Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=joint.K, B_sp=joint.B_sp)
+    model = TwoInertiaModel(drive)
+    held = fit(model, stretches, base_paths(model), Segmentation(256), strategy=Strategy(hold_parameters=True))
+    noise = np.sqrt(np.diag(measurement_noise(held).covariance))
+    np.testing.assert_allclose(noise, np.sqrt(np.diag(held.covariance)), rtol=0.1)
 
 
 @pytest.mark.parametrize(("bias", "most"), [(0.0, 1.0), (1.0, _MOTION), (5.0, 1.0)])
