@@ -250,12 +250,13 @@ def _supported_first(
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None:
             break
+        hopeless = verdict.gain <= 0.0 or verdict.p_value > RULES.significance
+        if hopeless and asked:
+            # Where whole stretches chose the first one, those behind it may gain more.
+            continue
         asked.append(ask(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
-        if verdict.gain <= 0.0 or verdict.p_value > RULES.significance:
-            # The following ones gain less.
-            break
     return verdicts, tuple(asked), False
 
 
