@@ -4,7 +4,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, attempt, continued, halo_for
 from fitting.attribution.candidate_refit import under_best_hold
