@@ -266,8 +266,10 @@ def _on_the_way(before: Trial, best: float, share: float) -> float:
 
 
 def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
-    """The candidates, with ties of the first one marked; and the evidence for them: what each refitted one lacks of the
-    first one's score, block by block, and of its gain."""
+    """The candidates, with ties of the first one marked; and the evidence for them.
+
+    That is what each refitted one lacks of the first one's score, block by block, and of its gain.
+    """
     if not verdicts or (first := verdicts[0].trial) is None:
         return verdicts, RoundEvidence()
     whitening = np.asarray(first.held_out.problem.whitening)

@@ -31,17 +31,17 @@ class Dependence(eqx.Module):
 
 
 class ResidualDiagnostics(eqx.Module):
-    """Diagnostics of a fit's residual dynamic error.
+    """Diagnostics of the residual of a fit's principal output, in its unit.
 
     Attributes:
         frequency: of the spectrum [Hz].
-        spectral_density: of the residual [rad^2/Hz].
+        spectral_density: of the residual, in its unit squared per Hz.
         order: cycles per motor revolution; empty without a motor angle or where the motor hardly turns.
-        order_amplitude: amplitude of the residual locked to each order [rad].
+        order_amplitude: amplitude of the residual locked to each order.
         autocorrelation: at lags 0, 1, 2, ... samples.
         white_limit: 95 % limit of a white residual's autocorrelation.
         dependence: on `x`, `v`, `motor angle`, `motor speed`, by name.
-        rms: of the residual [rad].
+        rms: of the residual.
     """
 
     frequency: Float[np.ndarray, " frequencies"]

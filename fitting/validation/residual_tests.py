@@ -81,7 +81,7 @@ class ResidualTests(eqx.Module):
 
 
 def residual_tests(fit: Fit, diagnostics: ResidualDiagnostics) -> ResidualTests:
-    """Test the residual dynamic error of a fit.
+    """Test the residual of a fit's principal output.
 
     Args:
         fit: the fit.
@@ -105,7 +105,7 @@ def zero_mean(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
 
     Args:
         residual: of the fit.
-        autocorrelation: of the residual, at lags 0, 1, 2, ... ...
+        autocorrelation: of the residual, at lags 0, 1, 2, ...
     """
     n, mean, spread = residual.size, float(residual.mean()), float(residual.std()) or 1.0
     statistic = n * (mean / spread) ** 2 / _memory(autocorrelation, n, power=1)
@@ -195,7 +195,7 @@ def normality(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
 
     Args:
         residual: with mean zero.
-        autocorrelation: of the residual, at lags 0, 1, 2, ... ...
+        autocorrelation: of the residual, at lags 0, 1, 2, ...
     """
     n = residual.size
     standard = residual / np.sqrt(np.mean(residual**2))
