@@ -22,6 +22,7 @@ from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
 from fitting.uncertainty.one_side import without_mesh_priors
+from fitting.uncertainty.standard_errors import uncertainty
 from fitting.validation.account import free_runs
 from fitting.validation.free_run_check import share_explained, surprise
 from hdjax import Hold
@@ -90,12 +91,17 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     runs = _along_selection(fitted, current.hold, study, covariance)
     outcome = claimed
     if claimed == "effect_found":
-        known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
         explained = share_explained(at_first, runs, current.held_out, covariance)
         seen = replace(seen, free_runs_explained=explained)
         # Bands are of first order: chaotic motion exceeds them, though short segments leave only noise.
         much = explained is None or explained >= RULES.free_run_explained
         if not (much and challenge.seen.enough):
+            known = {
+                "of_parameters": uncertainty(fitted),
+                "noise": covariance,
+                "halo": study.setting.halo,
+                "torque_noise": noise_of_torque(left) or 0.0,
+            }
             ratio = surprise(fitted, runs, current.held_out, **known)
             if ratio is not None:
                 # What is slow may differ between the fitted part of a log and the rest.
@@ -103,15 +109,17 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
             seen = replace(seen, surprise=ratio, wide_bands=ratio is None)
         outcome, _ = conclude(seen)
     found = Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left, side)
-    return _with_term_in_place(found, base, study, noise) if outcome != claimed else found
+    if outcome == claimed:
+        return found
+    instead = challenge.instead or learn_supported(base, study)
+    return found if instead is None else _with_term_in_place(found, instead, base, study, noise)
 
 
-def _with_term_in_place(found: Conclusion, base: Trial, study: Study, noise: MeasurementNoise) -> Conclusion:
+def _with_term_in_place(
+    found: Conclusion, instead: Unknown, base: Trial, study: Study, noise: MeasurementNoise
+) -> Conclusion:
     """The conclusion with a learned term in place of names that do not follow long stretches, where it does so better;
     else the same. The evidence against the names remains."""
-    instead = learn_supported(base, study)
-    if instead is None:
-        return found
     # Not what the names left, which may have been attributed to noise.
     covariance = noise.and_beside(instead.trial.training).covariance
     seen = _final_evidence(base, base, instead, covariance)

@@ -74,6 +74,7 @@ def rig_of(
     """[`read_rig`][] for logs already read."""
     if logs[0].kind == "quasi-static":
         raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
+    logs, test = _equally_warm(logs, test)
     stated = drive_file.torque_hold
     holds = HOLDS if stated is None or other_holds else (stated,)
     parts, zeros = [], []
@@ -102,6 +103,24 @@ def rig_of(
         logs=fitted,
         findings=findings,
     )
+
+
+def _equally_warm(logs: tuple[Log, ...], test: tuple[Log, ...]) -> tuple[tuple[Log, ...], tuple[Log, ...]]:
+    """Logs to fit and test logs, without the temperature where some of them lack it."""
+    lacking = next((log for log in (*logs, *test) if log.temperature is None), None)
+    if lacking is None:
+        return logs, test
+    finding = Finding(
+        "warning",
+        f"{lacking.name} has none",
+        "temperature",
+        "it was left out, since a model with it could not be simulated along that log",
+    )
+
+    def without(log: Log) -> Log:
+        return log if log.temperature is None else replace(log, temperature=None, findings=(*log.findings, finding))
+
+    return tuple(map(without, logs)), tuple(map(without, test))
 
 
 Source = tuple[Path, Any]

@@ -202,10 +202,12 @@ def _named_findings(
         rmse_without: the same without each effect that was kept.
     """
     effects = {e.name: e for e in final.effects}
+    # A form that was dropped may be accepted again: its last round counts.
+    winners = {this.winner.name: this.winner for this in rounds if this.accepted}
     found = [
-        Finding(effects.get(w.name), w.name, w.family, _gain(rmse, rmse_without[w.name]), w.p_value)
-        for w in (this.winner for this in rounds if this.accepted)
-        if w.name in rmse_without
+        Finding(effects.get(name), name, w.family, _gain(rmse, rmse_without[name]), w.p_value)
+        for name, w in winners.items()
+        if name in rmse_without
     ]
     return tuple(sorted(found, key=lambda f: (np.isnan(f.gain), -f.gain)))
 

@@ -34,7 +34,7 @@ class Finding(eqx.Module):
         family: its family.
         gain: share of the free-run error on selection data that it removes, relative to the same model without it; for
             named effects, without learned terms. NaN where free runs diverge with it.
-        p_value: under the null distribution of the catalogue's best on noise.
+        p_value: under the null distribution of the catalogue's best on noise; of a learned term, under its own.
     """
 
     effect: Effect | None
@@ -134,7 +134,7 @@ class Loop(eqx.Module):
             accepted that leave more than noise, or do not explain them; None otherwise, or where bands say nothing.
         parameters_from: "torque"; or the "load equation" or "motor equation" for K, alpha and B_sp of the final model,
             see [`fitting.one_side_check`][].
-        put_back: time offset subtracted from each log's clock [s], so that a line is in phase.
+        put_back: time offset subtracted from the clock of each training stretch [s], so that a line is in phase.
         seconds: time by stage.
         limited: whether the largest number of effects ended the search.
     """

@@ -239,7 +239,7 @@ def test_learned_term_replaces_an_effect_that_does_not_explain_free_runs(monkeyp
     def unchallenged(base, named, *args, **options):
         seen = model_evidence(named, options["noise"])
         left = noise_model(named.training, options["noise"].covariance, predictable=RULES.innovations)
-        return Challenge(named, None, left, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
+        return Challenge(named, None, left, None, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
 
     monkeypatch.setattr(loop_module, "challenge_names", unchallenged)
     experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)

@@ -3,15 +3,18 @@
 from pathlib import Path
 
 import mutations
+import numpy as np
 import pytest
 
 from fitting.drive_data import read_rig
 from fitting.errors import InputError
 
 
-def write(folder: Path, name: str, seed: int) -> Path:
+def write(folder: Path, name: str, seed: int, *, warm: bool = False) -> Path:
     folder.mkdir(exist_ok=True)
     table = mutations.healthy(seed)
+    if warm:
+        table["temperature"] = np.linspace(293.0, 303.0, mutations.ROWS)
     lines = [",".join(table), *(",".join(f"{v:.12g}" for v in row) for row in zip(*table.values(), strict=True))]
     (folder / name).write_text("\n".join(lines), encoding="utf-8")
     return folder / name
@@ -46,3 +49,17 @@ def test_numbers_of_names_are_those_of_no_file(tmp_path: Path, drive: Path):
 def test_logs_of_two_kinds_are_refused(tmp_path: Path, drive: Path):
     with pytest.raises(InputError, match="can't be fitted together"):
         read_rig([write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 4)], drive)
+
+
+def test_temperature_counts_only_where_all_logs_have_one(tmp_path: Path, drive: Path):
+    """An effect of temperature could not be simulated along the other logs."""
+    warm, other = (write(tmp_path, f"{name}.csv", i, warm=True) for i, name in enumerate(("warm", "other")))
+    bare = write(tmp_path, "bare.csv", 2)
+    found = read_rig([warm], drive, test=[other])
+    assert all(e.temperature is not None for some in (found.experiments, found.test) for e in some["linear"])
+    assert not any("temperature" in str(finding) for some in found.findings.values() for finding in some)
+    for found in (read_rig([warm], drive, test=[bare]), read_rig([warm, bare], drive, test=[other])):
+        assert all(e.temperature is None for some in (found.experiments, found.test) for e in some["linear"])
+        told = {name: [f.what for f in some if f.where == "temperature"] for name, some in found.findings.items()}
+        assert told.pop("bare") == []
+        assert all(what == ["bare has none"] for what in told.values())

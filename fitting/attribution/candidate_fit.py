@@ -97,20 +97,16 @@ def _count_at_bounds(model: Model) -> int:
     return sum(len(parameters_at_bounds(model, effect.name)) for effect in model.effects)
 
 
-def challenge(
-    models: Sequence[Model], study: Study, hold: Hold, *, champion: Trial, give_up_above: float = np.inf
-) -> Trial | None:
-    """The best fit of several starts, if it explains the training data at least as well as the current model.
+def challenge(model: Model, study: Study, hold: Hold, *, champion: Trial) -> Trial | None:
+    """The fit of a model, if it explains the training data at least as well as the current model.
 
     Args:
-        models: the same model at several starting values.
+        model: equations and starting values.
         study: the data and their segmentation.
         hold: inter-sample behaviour of the torque.
         champion: the current model.
-        give_up_above: an objective that it must reach.
     """
-    first = first_pass(models, study, hold, champion=champion)
-    return completed(first, study, hold, champion=champion, give_up_above=give_up_above)
+    return completed(first_pass([model], study, hold, champion=champion), study, hold, champion=champion)
 
 
 def first_pass(
@@ -148,8 +144,15 @@ def first_pass(
 
 
 def completed(first: Fit, study: Study, hold: Hold, *, champion: Trial, give_up_above: float = np.inf) -> Trial | None:
-    """The completed fit of a challenger after its first pass, or None where it is given up; arguments as in
-    [`challenge`][]."""
+    """The completed fit of a challenger after its first pass, or None where it is given up.
+
+    Args:
+        first: the first pass.
+        study: the data and their segmentation.
+        hold: inter-sample behaviour of the torque.
+        champion: the current model.
+        give_up_above: an objective that it must reach.
+    """
     to_judge, study = study, study.for_rivals()
     before = champion.training.objective
     limit = min(give_up_above, before + RULES.least_gain)

@@ -97,9 +97,8 @@ def complete_refit(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_
 
 
 def _unstuck(model: Model, scales: Scales) -> list[Model]:
-    """For each effect of which a parameter ended at a bound, or a shape has vanished, the model with these at the
-    values of its proposals, and the others as they are. A shape without limit ends in a simpler law, far from the
-    optimum.
+    """Models with the parameters of each effect that ended at a bound, and its vanished shapes, at the values of its
+    proposals. The others stay as they are. A shape without limit ends in a simpler law, far from the optimum.
     """
     found = {}
     for effect in model.effects:
@@ -126,7 +125,7 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
     near = trained(_as_late(before, hold), study, hold, before.training, _HOLD_STEPS)
     if near.objective > before.training.objective + RULES.least_gain:
         return None
-    return challenge([near.model], study, hold, champion=before)
+    return challenge(near.model, study, hold, champion=before)
 
 
 def under_best_hold(current: Trial, study: Study) -> Trial:

@@ -72,9 +72,9 @@ class RoundEvidence:
 
     Attributes:
         asked: evidence for the leading candidate, and for better ones that the data do not support.
-        behind: score difference of the chosen candidate and each refitted one, block by block.
+        behind: score of the candidate that led when ties were marked, minus that of each refitted one, block by block.
         rivals: those that competed over whole stretches.
-        lost: gain of the chosen candidate minus that of each refitted one.
+        lost: gain of the candidate that led when ties were marked, minus that of each refitted one.
     """
 
     asked: tuple[EffectEvidence, ...] = ()
@@ -92,7 +92,7 @@ class ModelEvidence:
         selection: likewise on selection data.
         parameters: number of free parameters.
         excess: residual of each output over short segments of the selection data, over the measurement noise.
-        white: whether the training residual of the dynamic error is white, and that of each output is within the noise.
+        white: whether the training residual of the principal output is white, and that of each output within the noise.
     """
 
     training: float

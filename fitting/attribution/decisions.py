@@ -156,7 +156,8 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
 
     Named effects are rejected where a learned term in their place predicts selection data as well as one beside them,
     or better than they do with fewer parameters. It must also differ from the named effects, or predict far better with
-    fewer parameters.
+    fewer parameters. A term beside which a name is not significant counts as different. Free runs with the term in
+    place of the names must be at most `lasting` worse.
 
     Args:
         seen: the evidence.

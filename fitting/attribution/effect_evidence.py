@@ -10,15 +10,8 @@ from fitting.estimation.projection import solved
 from fitting.first_order.gains import LinearisedFit, linearise_along, products
 from fitting.first_order.motion import place_of
 from fitting.uncertainty.innovations import spread_evenly
-from hdjax import Drive, Model
-from hdjax.effects import (
-    Effect,
-    MeshGeometryEffect,
-    MeshTorqueEffect,
-    Motion,
-    SensorEffect,
-    ShaftEffect,
-)
+from hdjax import Model
+from hdjax.effects import Effect, MeshTorqueEffect, Motion, ShaftEffect
 from hdjax.effects.learned import Learned, LearnedTorque
 from hdjax.effects.learned_axes import ANGLES
 from hdjax.engine.pointwise import at_instants
@@ -32,21 +25,19 @@ _INSTANTS = 1500
 
 
 class Evidence(eqx.Module):
-    """The torque or error of one effect over the variable that shows it best.
+    """The torque of one effect over the variable that shows it best.
 
     Attributes:
         effect: its name.
-        quantity: "torque" [N m], or "error" [rad] of the gear or an encoder.
         variable: the abscissa; angles within one turn.
         at: the variable at instants of the motion.
-        does: torque or error of the effect at these instants.
-        places: values of the variable for the estimate, one row for each direction of the motion; none for errors.
+        does: torque of the effect at these instants [N m].
+        places: values of the variable for the estimate, one row for each direction of the motion.
         told: torque estimated from the data there, with all parameters as fitted.
         std: standard error of `told`, for a white residual.
     """
 
     effect: str = eqx.field(static=True)
-    quantity: str = eqx.field(static=True)
     variable: str = eqx.field(static=True)
     at: Float[np.ndarray, " instants"]
     does: Float[np.ndarray, " instants"]
@@ -84,13 +75,12 @@ def _evidence(look: LinearisedFit, effect: Effect) -> Evidence | None:
     some = some[spread_evenly(some.size, _INSTANTS)]
     at, done = value.reshape(-1)[some], does.reshape(-1)[some]
     form = place_of(effect)
-    if form is None:
-        nothing = np.zeros((0, _PLACES))
-        return Evidence(effect.name, "error", effect.drawn_against, at, done, nothing, nothing, nothing)
+    # Only torques are drawn against a quantity.
+    assert form is not None
     # The effect acts at samples without valid outputs as well.
     signs = np.where(known, _directions(effect, look.motion), np.nan)
     places, told, std = _told(look, form, value, does, kept, signs)
-    return Evidence(effect.name, "torque", effect.drawn_against, at, done, places, told, std)
+    return Evidence(effect.name, effect.drawn_against, at, done, places, told, std)
 
 
 def _directions(effect: Effect, motion: Motion) -> np.ndarray:
@@ -105,20 +95,14 @@ def _directions(effect: Effect, motion: Motion) -> np.ndarray:
 
 
 def _done(state: Array, named: tuple[str, Model], motion: Motion) -> Array:
-    """Torque or error of a named effect at an instant."""
+    """Torque of a named effect at an instant."""
     name, model = named
     effect = model.effect(name)
     names = model.state_names
-    if isinstance(effect, MeshTorqueEffect | ShaftEffect):
-        own = [state[names.index(f"{name}.{s}")] for s in effect.states]
-        # A model has the drive that its effects need.
-        return effect.torque(motion, model.drive, jnp.array(own))  # pyright: ignore[reportArgumentType]
-    assert isinstance(model.drive, Drive) and motion.theta_m is not None and motion.theta_l is not None
-    if isinstance(effect, MeshGeometryEffect):
-        return effect.error(motion.theta_m)
-    assert isinstance(effect, SensorEffect) and motion.omega_m is not None and motion.omega_l is not None
-    theta_m, theta_l = effect.reading(motion.theta_m, motion.theta_l, motion.omega_m, motion.omega_l)
-    return (theta_m - motion.theta_m) / model.drive.N - (theta_l - motion.theta_l)
+    assert isinstance(effect, MeshTorqueEffect | ShaftEffect)
+    own = [state[names.index(f"{name}.{s}")] for s in effect.states]
+    # A model has the drive that its effects need.
+    return effect.torque(motion, model.drive, jnp.array(own))  # pyright: ignore[reportArgumentType]
 
 
 def _told(

@@ -119,7 +119,9 @@ def search_effects(
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
     current, compared, instead = compare_again(kept, current, study)
     if instead:
-        rounds, dropped = [*rounds, *instead.values()], [*dropped, *instead]
+        rounds, again = [*rounds, *instead.values()], {this.winner.name for this in instead.values()}
+        # A form that was dropped may come back in the place of another one.
+        dropped = [name for name in (*dropped, *instead) if name not in again]
         kept = [instead[name] if (name := this.winner.name) in instead else this for this in kept]
         # Beside a better law another effect may explain nothing.
         names = [this.winner.name for this in kept]

@@ -10,7 +10,7 @@ from jaxtyping import Complex, Float
 
 from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.rules import RULES
-from fitting.attribution.study import Data, Study
+from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, log_of, segments_by
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import effect_paths
@@ -119,12 +119,18 @@ def with_clock_shifts(
 ) -> dict[Hold, tuple[Stretch, ...]]:
     """Test stretches with the time offsets of the logs that they belong to."""
     by_log = {log_of(s): by for s, by in zip(fitted, late, strict=True)}
-    return {h: tuple(_put_back(s, by_log.get(log_of(s), 0.0)) for s in some) for h, some in tests.items()}
+    return {hold: _put_back(some, by_log) for hold, some in tests.items()}
 
 
-def _put_back(stretch: Stretch, by: float) -> Stretch:
-    experiment = stretch.experiment
-    return replace(stretch, experiment=replace(experiment, origin=experiment.origin + float(by)))
+def _put_back(stretches: Sequence[Stretch], late: Mapping[str, float]) -> tuple[Stretch, ...]:
+    """Stretches with the time offset of their log, if it has one, subtracted from the clock."""
+
+    def each(stretch: Stretch) -> Stretch:
+        experiment = stretch.experiment
+        origin = experiment.origin + float(late.get(log_of(stretch), 0.0))
+        return replace(stretch, experiment=replace(experiment, origin=origin))
+
+    return tuple(map(each, stretches))
 
 
 def _set_by(seen: Phasors, base: Trial, study: Study) -> Study | None:
@@ -132,7 +138,8 @@ def _set_by(seen: Phasors, base: Trial, study: Study) -> Study | None:
     near = base
     for _ in range(_REFITS):
         late = dict(zip(segments_by(near.training, log_of), seen.late.tolist(), strict=True))
-        study = replace(study, data=_with_clocks_put_back(study.data, late))
+        data = {hold: (_put_back(one, late), _put_back(other, late)) for hold, (one, other) in study.data.items()}
+        study = replace(study, data=data)
         near = attempt(base.model.with_effects(seen.in_phase.effect), study, base.hold, start=near)
         if not near.training.objective < base.training.objective - RULES.least_gain:
             return None
@@ -140,13 +147,6 @@ def _set_by(seen: Phasors, base: Trial, study: Study) -> Study | None:
         if np.all(np.abs(seen.late) * seen.omega * seen.told < _SETTLED):
             break
     return study
-
-
-def _with_clocks_put_back(data: Data, late: Mapping[str, float]) -> Data:
-    def each(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-        return tuple(_put_back(s, late[log_of(s)]) for s in stretches)
-
-    return {hold: (each(training), each(selection)) for hold, (training, selection) in data.items()}
 
 
 def _lines(found: Fit) -> list[Phasors]:

@@ -38,8 +38,10 @@ def compare_again(kept: Sequence[Round], current: Trial, study: Study) -> tuple[
 
 
 def _decided_again(this: Round, current: Trial, study: Study) -> tuple[Round, ...]:
-    """A round without its ties and the other forms of its family, and the comparison of these with its effect in the
-    final model, the chosen one first; the round alone where it has none, or is about a hold. Holds stay where they are.
+    """A round without its rivals, and their comparison with its effect in the final model, the chosen one first.
+
+    Rivals are its ties and the other forms of its family. It is the round alone where there are none, or where it is
+    about a hold. Holds stay where they are.
 
     Args:
         this: an accepted round.
@@ -73,7 +75,7 @@ def _instead_of(winner: Verdict, other: Verdict, effect: Effect, current: Trial,
     """The result of another form in the place of a round's effect in the final model; without a trial where it explains
     less, or the data do not determine it."""
     model = current.model.without_effect(winner.name).with_effects(effect)
-    trial = challenge([model], study, current.hold, champion=current)
+    trial = challenge(model, study, current.hold, champion=current)
     if trial is not None and not _is_determined(trial, effect.name):
         trial = None
     lost = 0.0 if trial is None else trial.held_out.objective - current.held_out.objective

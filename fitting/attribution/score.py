@@ -21,9 +21,10 @@ def block_scores(trial: Trial, whitening: Float[np.ndarray, "outputs outputs"]) 
     """
     white = np.asarray(trial.held_out.error) @ np.asarray(whitening).T
     weight = np.asarray(trial.held_out.problem.segments.weight).sum(axis=1)
-    kept = weight > 0
-    squares, numbers = (white**2).sum(axis=(1, 2))[kept], weight[kept] * white.shape[2]
-    count = min(_MOST_BLOCKS, squares.size)
-    block = np.arange(squares.size) * count // squares.size
-    squares, numbers = (np.bincount(block, values) for values in (squares, numbers))
-    return -numbers * np.log1p(squares / numbers)
+    # A delay of the readings may leave a segment without samples, which still counts: blocks are the same for all.
+    pieces = int(trial.held_out.pieces.sum())
+    squares, numbers = (white**2).sum(axis=(1, 2))[:pieces], weight[:pieces] * white.shape[2]
+    count = min(_MOST_BLOCKS, pieces)
+    block = np.arange(pieces) * count // pieces
+    squares, numbers = (np.bincount(block, values, minlength=count) for values in (squares, numbers))
+    return -numbers * np.log1p(squares / np.maximum(numbers, 1.0))

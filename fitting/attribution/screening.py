@@ -67,7 +67,10 @@ class Screen(eqx.Module, Generic[LeadT]):
     null_gains: Float[np.ndarray, " draws"]
 
     def p_value(self, gain: float) -> float:
-        """p-value of a gain under the null distribution of the catalogue's best."""
+        """p-value of a gain under the null distribution of the catalogue's best; one where that is unknown."""
+        if not np.isfinite(self.null_gains).any():
+            # The response to every form diverges.
+            return 1.0
         return (1 + int(np.sum(self.null_gains >= gain))) / (1 + self.null_gains.size)
 
 

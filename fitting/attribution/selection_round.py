@@ -250,12 +250,13 @@ def _supported_first(
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None:
             break
+        hopeless = verdict.gain <= 0.0 or verdict.p_value > RULES.significance
+        if hopeless and asked:
+            # Where whole stretches chose the first one, those behind it may gain more.
+            continue
         asked.append(ask(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
-        if verdict.gain <= 0.0 or verdict.p_value > RULES.significance:
-            # The following ones gain less.
-            break
     return verdicts, tuple(asked), False
 
 
@@ -265,8 +266,10 @@ def _on_the_way(before: Trial, best: float, share: float) -> float:
 
 
 def with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], RoundEvidence]:
-    """The candidates, with ties of the first one marked; and the evidence for them: what each refitted one lacks of the
-    first one's score, block by block, and of its gain."""
+    """The candidates, with ties of the first one marked; and the evidence for them.
+
+    That is what each refitted one lacks of the first one's score, block by block, and of its gain.
+    """
     if not verdicts or (first := verdicts[0].trial) is None:
         return verdicts, RoundEvidence()
     whitening = np.asarray(first.held_out.problem.whitening)

@@ -22,8 +22,8 @@ _FAMILIES = 5
 _FEWER_STATES = 0.25
 # Number of further forms that are refitted of the best one's family, and of each close one.
 _FORMS = 3
-# If an effect leaves only noise, others can at best be tied with it: those with at least this share of its first-order
-# gain,
+# If an effect leaves only noise, others can at best be tied with it. Only those with at least this share of its
+# first-order gain are refitted.
 _POSSIBLE_TIE = 0.5
 
 
@@ -81,8 +81,10 @@ def _simplest(leads: Sequence[Lead]) -> Lead:
 
 
 def possible_ties(leads: Sequence[Lead], first: Sequence[Lead], suspects: Sequence[Lead] = ()) -> list[Lead]:
-    """Possible ties of the best form, which leaves only noise: other families, each with the forms that are equal to
-    its first one to first order, and forms of its family with a larger first-order gain.
+    """Possible ties of the best form, which leaves only noise.
+
+    They are forms of other families, equal to the first one of their family to first order, and forms of its own family
+    with a larger first-order gain.
 
     Args:
         leads: all forms that may be refitted.

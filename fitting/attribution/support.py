@@ -141,9 +141,10 @@ class Standing:
         return noise_model(trial.training, noise.covariance, **known)
 
     def over_noise(self, trial: Trial) -> float:
-        """Log likelihood ratio [nats] of a model against the current one, each with its own noise model, minus the
-        penalty of its further parameters (Schwarz 1978). Infinite where noise does not explain the current model's
-        residual.
+        """Log likelihood ratio [nats] of a model against the current one, each with its own noise model.
+
+        The penalty of its further parameters (Schwarz 1978) is subtracted. The ratio is infinite where noise does not
+        explain the current model's residual.
 
         Where the estimate of the measurement noise beside the model is the smaller one, both have that as well: what
         the current model lacks may have inflated and correlated the other.

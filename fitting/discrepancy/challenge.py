@@ -38,6 +38,7 @@ class Challenge(eqx.Module):
         trusted: the model with the accepted names.
         unknown: the term learned beside them, or in place of all.
         left: noise of sensors and torque, where that explains the named model's residual.
+        instead: the term learned in place of all names; None where none was learned, or is supported.
         tied: a learned term that differs from the accepted names and explains the selection data as well.
         seen: evidence for the decision.
     """
@@ -45,6 +46,7 @@ class Challenge(eqx.Module):
     trusted: Trial
     unknown: Unknown | None
     left: NoiseModel | None
+    instead: Unknown | None
     tied: Unknown | None
     seen: ChallengeEvidence = eqx.field(static=True)
 
@@ -103,7 +105,7 @@ def _challenged(
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
     left = left if beside is None and is_noise(left) else None
     if named is base:
-        return Challenge(base, beside, left, None, seen)
+        return Challenge(base, beside, left, instead, None, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
         errors = _long_errors([rival, instead.trial], study)
@@ -120,13 +122,13 @@ def _challenged(
             and any(other.variables == (e.one_shape_of,) for e in named.model.effects),
         )
     if not any(check.holds for check in names_stand(seen)):
-        return Challenge(base, instead, None, None, seen)
+        return Challenge(base, instead, None, instead, None, seen)
     if instead is not None and beside is None:
         whitening = np.asarray(instead.trial.held_out.problem.whitening)
         behind = block_scores(named, whitening) - block_scores(instead.trial, whitening)
         seen = replace(seen, behind=tuple(map(float, behind)))
     tied = any(check.holds for check in unknown_ties(seen))
-    return Challenge(named, beside, left, instead if tied else None, seen)
+    return Challenge(named, beside, left, instead, instead if tied else None, seen)
 
 
 def _come_out(base: Trial, named: Trial, instead: Unknown) -> float:

@@ -99,15 +99,15 @@ def learn(before: Trial, study: Study) -> Unknown | None:
     best = _likeliest(alone, None, before, study)
     memory: MemoryScreen | None = None
     remembered: tuple[MemoryCandidate, Trial] | None = None
-    refitted = False
-    if not (faint or _is_enough(best)):
+    refitted, enough = False, _is_enough(best)
+    if not (faint or enough):
         memory = screen_memory(before, seen, study, least=least)
         # A law with memory has fewer parameters than a function of two variables.
         refitted = bool(memory.candidates) and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0)
         if refitted:
             remembered = memory.put_inside(before, study, rival=best)
     if not _is_enough(remembered):
-        if not _is_enough(best):
+        if not enough:
             worth = [c for c in pairs if best is None or c.gain >= best[0].gain + RULES.variable]
             best = _likeliest(worth, best, before, study)
         best = None if best is None else _refined(best, study)
@@ -269,7 +269,7 @@ def _refitted(before: Trial, candidate: Candidate, study: Study, c: np.ndarray) 
     effect = eqx.tree_at(lambda e: e.c, candidate.effect, tuple(map(as_scalar, c)))
     bare = before.model.without_effect(name) if name in {e.name for e in before.model.effects} else before.model
     patient = replace(study, setting=replace(study.setting, least_progress=_LEAST_PROGRESS))
-    return challenge([bare.with_effects(effect)], patient, before.hold, champion=before)
+    return challenge(bare.with_effects(effect), patient, before.hold, champion=before)
 
 
 def _as_before(old: Candidate, trial: Trial, new: Candidate, seen: SearchContext) -> np.ndarray:

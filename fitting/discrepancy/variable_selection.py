@@ -10,6 +10,7 @@ from itertools import combinations
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.linalg import block_diag, eigh, null_space
 
 from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit
@@ -185,12 +186,12 @@ def own_functions(seen: SearchContext, form: type[Learned]) -> Float[np.ndarray,
 
 def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.ndarray]) -> Sizes:
     """The functions of the axes, and their slopes for an error of the mesh."""
-    along = [(values[axis.variable], axis) for axis in axes]
-    raw = _all_products([at_instants(_functions_along, (value, value.ndim), (axis, 0)) for value, axis in along])
+    along = [((values[axis.variable][..., None], values[axis.variable].ndim), (axis, 0)) for axis in axes]
+    raw = _all_products([at_instants(_functions_of_one, *each) for each in along])
     if not issubclass(form, LearnedMeshError):
         return (raw,)
-    ((value, axis),) = along
-    return raw, slopes_at_instants(_functions_of_one, (value[..., None], value.ndim), (axis, 0))[..., 0]
+    (each,) = along
+    return raw, slopes_at_instants(_functions_of_one, *each)[..., 0]
 
 
 def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -209,10 +210,6 @@ def _ranges(seen: SearchContext, variables: tuple[str, ...]) -> dict[str, tuple[
         reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
         found[variable] = (float(low), float(low + reach))
     return found
-
-
-def _functions_along(value: Array, axis: Axis) -> Array:
-    return axis.functions(value)
 
 
 def _functions_of_one(value: Array, axis: Axis) -> Array:
@@ -332,8 +329,6 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
 def _roughness_along(axis: Axis) -> np.ndarray:
     if isinstance(axis, SignAxis):
         beside = [] if axis.beside is None else [_roughness_along(axis.beside)]
-        from scipy.linalg import block_diag
-
         return np.asarray(block_diag(_ROUGHNESS_OF_A_SIGN, *beside))
     if isinstance(axis, AngleAxis | PeriodicAxis):
         order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
@@ -360,8 +355,6 @@ def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.nd
 def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Combinations of functions, smoothest first, of unit rms on the data, uncorrelated with each other and with known
     functions (basis of Demmler and Reinsch 1975)."""
-    from scipy.linalg import eigh, null_space
-
     moment = raw.T @ raw / len(raw)
     free = null_space((raw.T @ known / len(raw)).T, rcond=1e-8) if known.shape[1] else np.eye(raw.shape[1])
     inside = free.T @ moment @ free

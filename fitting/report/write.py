@@ -109,7 +109,7 @@ def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperim
         last.append(next_experiment_plot(proposed, unit=units["dynamic_error"], forcing_unit=units["forcing"]))
     if isinstance(outcome, Loop):
         found = plots(outcome, units=units)
-        quantities = {"torque": "N m", "error": "rad"} | UNITS
+        quantities = {"torque": "N m"} | UNITS
         in_log = {name: unit_in_log(unit, outcome, units) for name, unit in quantities.items()}
         found += [evidence_plot(seen, units=in_log) for seen in outcome.evidence]
         learned, told = curve_of(outcome), report["unknown"]

@@ -58,7 +58,7 @@ class Account(eqx.Module):
 
     @property
     def judged(self) -> tuple[FreeRun, ...]:
-        """The free runs by which the model is judged: on test data, else on selection data."""
+        """The free runs by which the model is judged: on test data, else selection data, else training data."""
         return self.test or self.selection or self.training
 
 
@@ -69,8 +69,8 @@ def account(
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int,
+    known: tuple[Uncertainty, Identifiability],
     selection: tuple[FreeRun, ...] = (),
-    known: tuple[Uncertainty, Identifiability] | None = None,
 ) -> Account:
     """Free runs, standard errors and identifiability of a fit.
 
@@ -80,12 +80,12 @@ def account(
         test: test stretches.
         noise: covariance of the measurement noise.
         halo: intervals of torque before a stretch.
+        known: what is known of its parameters ([`of_parameters`][]).
         selection: free runs along the selection stretches.
-        known: what is known of its parameters ([`of_parameters`][]); by the fit alone if None.
     """
     # Separate runs, so that test data do not share the scale of a window.
     seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
-    found, told = of_parameters(fit) if known is None else known
+    found, told = known
     zeros = tuple(dict.fromkeys(stretch.experiment.zero for stretch in training))
     return Account(unaligned(fit.model), found, seen, selection, unseen, told, why_not(fit.problem), zeros)
 

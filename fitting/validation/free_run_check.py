@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
-from fitting.uncertainty.standard_errors import uncertainty
+from fitting.uncertainty.standard_errors import Uncertainty
 
 
 def share_explained(
@@ -35,6 +35,7 @@ def surprise(
     runs: Sequence[FreeRun] | None,
     short: Fit,
     *,
+    of_parameters: Uncertainty,
     noise: Float[Array, "outputs outputs"],
     halo: int,
     torque_noise: float = 0.0,
@@ -48,12 +49,13 @@ def surprise(
         final: the model with its effects.
         runs: its free runs along the stretches; simulated if None.
         short: the model on short segments of the stretches, whose residual contains all coloured noise.
+        of_parameters: uncertainty of the final fit's parameters.
         noise: covariance of the measurement noise, estimated from shorter pieces.
         halo: intervals of torque before a stretch.
         torque_noise: standard deviation of the noise of a torque sample [N m].
     """
     known = {"noise": _short_error(short, noise), "halo": halo, "runs": runs, "torque_noise": torque_noise}
-    return over_bands(prediction_bands(final, uncertainty(final), short.stretches, **known))
+    return over_bands(prediction_bands(final, of_parameters, short.stretches, **known))
 
 
 def _short_error(short: Fit, noise: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:

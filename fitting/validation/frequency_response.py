@@ -37,6 +37,8 @@ _LOBE = 2.0
 _GAP = 3
 # Largest ratio of the log's and the model's peak frequency.
 _NEAR = 2.0
+# Least share of the stiffness at rest that a softening spring leaves.
+_LEAST_STIFFNESS = 1e-6
 
 
 class FrequencyResponse(eqx.Module):
@@ -162,8 +164,9 @@ def _linearised(model: Model, experiments: Sequence[Experiment]) -> Model:
     """The model with its mean stiffness over the measured twist."""
     x = np.concatenate([twist(Stretch(e, 0, len(e)), model) for e in experiments])
     drive = model.drive
-    hardening = max(1.0 + 3.0 * float(drive.alpha) * float(np.mean(x**2)), 0.0)
-    # A softening spring may leave no stiffness, with which no drive can be made anew.
+    # A softening spring may leave no stiffness, by which widths of peaks are divided, and with which no drive can be
+    # made anew.
+    hardening = max(1.0 + 3.0 * float(drive.alpha) * float(np.mean(x**2)), _LEAST_STIFFNESS)
     if isinstance(drive, Drive):
         return eqx.tree_at(lambda m: m.drive.K, model, drive.K * hardening)
     return eqx.tree_at(lambda m: m.drive.omega_0, model, drive.omega_0 * math.sqrt(hardening))

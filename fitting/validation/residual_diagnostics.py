@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fitting.estimation.estimate import Fit
 from fitting.estimation.whiteness import autocorrelation, left_over
@@ -12,6 +12,8 @@ from hdjax import TwoInertiaModel
 
 _BINS = 40
 _ORDERS = np.arange(0.25, 10.01, 0.05)
+# Largest relative difference of equal sample intervals.
+_SAME_RATE = 0.01
 
 
 class Dependence(eqx.Module):
@@ -29,17 +31,17 @@ class Dependence(eqx.Module):
 
 
 class ResidualDiagnostics(eqx.Module):
-    """Diagnostics of a fit's residual dynamic error.
+    """Diagnostics of the residual of a fit's principal output, in its unit.
 
     Attributes:
         frequency: of the spectrum [Hz].
-        spectral_density: of the residual [rad^2/Hz].
+        spectral_density: of the residual, in its unit squared per Hz.
         order: cycles per motor revolution; empty without a motor angle or where the motor hardly turns.
-        order_amplitude: amplitude of the residual locked to each order [rad].
+        order_amplitude: amplitude of the residual locked to each order.
         autocorrelation: at lags 0, 1, 2, ... samples.
         white_limit: 95 % limit of a white residual's autocorrelation.
         dependence: on `x`, `v`, `motor angle`, `motor speed`, by name.
-        rms: of the residual [rad].
+        rms: of the residual.
     """
 
     frequency: Float[np.ndarray, " frequencies"]
@@ -56,8 +58,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     """Diagnostics of a fit's residual."""
     weight = np.asarray(fit.problem.segments.weight)[: fit.pieces.sum()] > 0
     residual = left_over(fit)
-    step = fit.stretches[0].experiment.time_step
-    frequency, power = density(residual, step=step, window=min(2048, residual.size))
+    frequency, power = _spectrum(fit)
     states = motion_states(fit)[:, :-1][weight].T
     order = amplitude = np.zeros(0)
     if isinstance(fit.model, TwoInertiaModel):
@@ -78,6 +79,22 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         dependence={name: _dependence(residual, q) for name, q in quantities.items()},
         rms=float(np.sqrt(np.mean(residual**2))),
     )
+
+
+def at_first_rate(fit: Fit) -> Bool[np.ndarray, " stretches"]:
+    """Which stretches have the sample rate of the first one."""
+    steps = np.array([stretch.experiment.time_step for stretch in fit.stretches])
+    return np.abs(steps / steps[0] - 1.0) < _SAME_RATE
+
+
+def _spectrum(fit: Fit) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, " frequencies"]]:
+    """Frequency [Hz] and spectral density of the residual of the stretches with the first one's sample rate."""
+    errors = fit.by_stretch(np.asarray(fit.error)[..., -1])
+    weights = fit.by_stretch(np.asarray(fit.problem.segments.weight))
+    of_rate = zip(errors, weights, at_first_rate(fit), strict=True)
+    residual = np.concatenate([error[weight > 0] for error, weight, same in of_rate if same])
+    step = fit.stretches[0].experiment.time_step
+    return density(residual, step=step, window=min(2048, residual.size))
 
 
 def order_amplitude(residual: np.ndarray, angle: np.ndarray, orders: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from fitting.estimation.estimate import Fit
 from fitting.estimation.whiteness import autocovariance, left_over, ljung_box
 from fitting.uncertainty.normal_law import NORMAL_95
-from fitting.validation.residual_diagnostics import ResidualDiagnostics
+from fitting.validation.residual_diagnostics import ResidualDiagnostics, at_first_rate
 from hdjax import TwoInertiaModel
 
 Verdict = Literal["passed", "slight", "failed"]
@@ -81,14 +81,14 @@ class ResidualTests(eqx.Module):
 
 
 def residual_tests(fit: Fit, diagnostics: ResidualDiagnostics) -> ResidualTests:
-    """Test the residual dynamic error of a fit.
+    """Test the residual of a fit's principal output.
 
     Args:
         fit: the fit.
         diagnostics: of the same fit; its autocorrelation is used.
     """
     residual = left_over(fit)
-    step = fit.stretches[0].experiment.time_step
+    step = fit.stretches[0].experiment.time_step if at_first_rate(fit).all() else None
     memory = diagnostics.autocorrelation
     tests = [zero_mean(residual, memory), whiteness(memory, residual.size)]
     residual = residual - residual.mean()
@@ -105,7 +105,7 @@ def zero_mean(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
 
     Args:
         residual: of the fit.
-        autocorrelation: of the residual, at lags 0, 1, 2, ... ...
+        autocorrelation: of the residual, at lags 0, 1, 2, ...
     """
     n, mean, spread = residual.size, float(residual.mean()), float(residual.std()) or 1.0
     statistic = n * (mean / spread) ** 2 / _memory(autocorrelation, n, power=1)
@@ -149,7 +149,7 @@ def whiteness(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> Resi
 
 
 def independence(
-    residual: Float[np.ndarray, " n"], signal: Float[np.ndarray, " n"], *, name: str, step: float
+    residual: Float[np.ndarray, " n"], signal: Float[np.ndarray, " n"], *, name: str, step: float | None
 ) -> tuple[InputCorrelation, ResidualTest]:
     """Test whether the residual is independent of an input at lags from 0 to [`LAGS`][].
 
@@ -160,7 +160,7 @@ def independence(
         residual: with mean zero.
         signal: the input, with mean zero.
         name: of the input.
-        step: sampling interval [s].
+        step: sampling interval [s]; None where logs have different ones.
     """
     n = residual.size
     most = min(LAGS, n // 4)
@@ -177,7 +177,8 @@ def independence(
     p_value = float(chdtrc(degrees, statistic))
     worst = int(np.argmax(np.abs(causal)))
     verdict = _verdict(p_value, bool(np.abs(causal[worst]) < _SLIGHT_CORRELATION))
-    behind = "at once" if worst == 0 else f"{1e3 * worst * step:.2g} ms later"
+    later = f"{worst} samples" if step is None else f"{1e3 * worst * step:.2g} ms"
+    behind = "at once" if worst == 0 else f"{later} later"
     told = f"correlation {causal[worst]:+.2g} {behind}"
     says = {
         "passed": f"The residual is independent of the {name}.",
@@ -194,7 +195,7 @@ def normality(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
 
     Args:
         residual: with mean zero.
-        autocorrelation: of the residual, at lags 0, 1, 2, ... ...
+        autocorrelation: of the residual, at lags 0, 1, 2, ...
     """
     n = residual.size
     standard = residual / np.sqrt(np.mean(residual**2))

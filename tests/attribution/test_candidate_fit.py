@@ -6,7 +6,7 @@ import pytest
 
 import rig
 from fitting.attribution import candidate_fit
-from fitting.attribution.candidate_fit import attempt, challenge, continued, halo_for
+from fitting.attribution.candidate_fit import attempt, challenge, completed, continued, first_pass, halo_for
 from fitting.attribution.study import Data, Setting, Study
 from fitting.estimation.base_fit import base_fit
 from fitting.estimation.experiment import split
@@ -38,7 +38,7 @@ def test_candidate_with_sharp_friction_gets_finer_solver_steps(base_trial_and_st
     """The smooth base model keeps its solver steps; a trial with friction determines the steps that it needs."""
     before, study = base_trial_and_study
     assert study.fine_enough(before.training) is study
-    found = challenge([with_friction(before.model, 50.0, 0.3)], study, HOLD, champion=before)
+    found = challenge(with_friction(before.model, 50.0, 0.3), study, HOLD, champion=before)
     assert found is not None
     assert found.training.substeps == found.held_out.substeps > study.setting.segmentation.substeps
     assert float(found.model.effects[0].T_c) == pytest.approx(SHARP[0], rel=0.02)
@@ -48,7 +48,8 @@ def test_candidate_that_explains_less_than_the_limit_is_rejected(base_trial_and_
     before, study = base_trial_and_study
     limit = before.training.objective - 20.0
     start = with_friction(before.model, 50.0, 0.3)
-    assert challenge([start], study, HOLD, champion=before, give_up_above=limit) is None
+    first = first_pass([start], study, HOLD, champion=before)
+    assert completed(first, study, HOLD, champion=before, give_up_above=limit) is None
 
 
 @pytest.mark.parametrize("gain, taken", [(0.0, False), (0.1, True)])

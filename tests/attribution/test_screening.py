@@ -59,6 +59,11 @@ def screen_with_friction() -> Screen:
     return screen(*fits(friction=(10.0, 0.27)), catalogue=SOME_FORMS)
 
 
+def test_no_gain_is_significant_where_the_null_distribution_is_unknown():
+    assert Screen((), np.full(4, -np.inf)).p_value(1.0) == 1.0
+    assert Screen((), np.array([-np.inf, 0.5, 2.0])).p_value(1.0) == 0.5
+
+
 @pytest.mark.parametrize(
     "catalogue", [SOME_FORMS, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["some", "all"]
 )

@@ -13,6 +13,7 @@ from fitting.attribution import selection_round as attribution
 from fitting.attribution import support
 from fitting.attribution.candidate_fit import Trial, attempt, halo_for
 from fitting.attribution.case_evidence import EffectEvidence
+from fitting.attribution.score import block_scores
 from fitting.attribution.screening import Lead, Screen
 from fitting.attribution.selection_round import Verdict, look
 from fitting.attribution.study import Setting, Study
@@ -192,6 +193,41 @@ def test_a_simpler_form_of_less_gain_is_asked_where_noise_explains_the_residual(
 
     ordered, asked, accepted = attribution._supported_first(tried, ask)
     assert accepted and ordered[0].name == "with_one_parameter" and len(asked) == 2
+
+
+def test_hopeless_candidates_are_skipped_but_the_first_is_asked(verdicts):
+    """Whole stretches may choose one that gains less over short segments than those behind it."""
+    _, found = verdicts
+    trial = found["torque_bias"].trial
+    chosen, none, better = (
+        Verdict(name, "family", trial, gain, p, True)
+        for name, gain, p in (("chosen", 0.01, 0.3), ("none", -1.0, 1.0), ("better", 0.1, 0.002))
+    )
+
+    def ask(verdict: Verdict) -> EffectEvidence:
+        return EffectEvidence(verdict.name, verdict.gain, verdict.p_value)
+
+    ordered, asked, accepted = attribution._supported_first([chosen, none, better], ask)
+    assert accepted and [v.name for v in ordered] == ["better", "chosen", "none"]
+    assert [seen.name for seen in asked] == ["chosen", "better"]
+    ordered, asked, accepted = attribution._supported_first([chosen, none], ask)
+    assert not accepted and ordered == [chosen, none] and [seen.name for seen in asked] == ["chosen"]
+
+
+def test_blocks_are_the_same_for_a_candidate_without_samples_in_a_segment(verdicts):
+    """A delay of an encoder moves its readings beyond the end of the log."""
+    before, _ = verdicts
+    last = int(before.held_out.pieces.sum()) - 1
+    moved = eqx.tree_at(
+        lambda t: (t.held_out.error, t.held_out.problem.segments.weight),
+        before,
+        replace_fn=lambda values: values.at[last].set(0.0),
+    )
+    whitening = np.asarray(before.held_out.problem.whitening)
+    every, some = block_scores(before, whitening), block_scores(moved, whitening)
+    assert every.size == some.size == last + 1
+    np.testing.assert_array_equal(every[:-1], some[:-1])
+    assert some[-1] == 0.0 > every[-1]
 
 
 def test_forms_that_the_best_one_contains_are_refitted(verdicts, monkeypatch: pytest.MonkeyPatch):

@@ -11,7 +11,9 @@ import pytest
 import rig
 from fitting.attribution import effect_search
 from fitting.attribution.candidate_refit import _with_form
-from fitting.loop import close_loop
+from fitting.attribution.study import Setting, Study
+from fitting.estimation.problem import Segmentation
+from fitting.loop import _named_findings, close_loop
 from hdjax.effects import BY_NAME, CATALOGUE, Creep, Effect, GravityLoad
 from hdjax.effects.friction import MotorFriction, ViscousLoadFriction, ViscousMotorFriction
 
@@ -86,3 +88,33 @@ def test_effect_whose_parameter_ended_at_a_bound_is_dropped(monkeypatch: pytest.
     assert dropped == ["creep"] and found is without_creep
     found, dropped, _ = effect_search._without_superfluous(["creep"], trial(-20.0, slow), base, cast(Any, None))
     assert dropped == ["creep"] and found is base
+
+
+def test_superfluous_form_that_comes_back_is_kept_and_told_once(monkeypatch: pytest.MonkeyPatch):
+    """Beside later effects a form that was dropped may be the better law of another one."""
+
+    def any_trial(*effects: Effect) -> Any:
+        own = trial(0.0, *effects)
+        return SimpleNamespace(model=own.model, hold="linear", training=SimpleNamespace(substeps=1))
+
+    base = any_trial()
+
+    def a_round(effect: Effect, p_value: float = 0.001) -> Any:
+        winner = SimpleNamespace(name=effect.name, family=effect.family, trial=any_trial(effect), p_value=p_value)
+        return SimpleNamespace(accepted=True, before=base, winner=winner)
+
+    creep, gravity = Creep(k=1.0, tau=1.0, span=1.0), GravityLoad(sine=1.0)
+    rounds, back = iter([a_round(creep), a_round(gravity)]), a_round(creep, 0.002)
+    superfluous = iter([(base, ["creep"], {}), (base, [], {"creep": base})])
+    monkeypatch.setattr(effect_search, "measurement_noise", lambda _: None)
+    monkeypatch.setattr(effect_search, "leaves_imperfection", lambda *_: (False, None))
+    monkeypatch.setattr(effect_search, "Standing", lambda *_, **__: None)
+    monkeypatch.setattr(effect_search, "look", lambda *_, **__: next(rounds))
+    monkeypatch.setattr(effect_search, "continued", lambda found, _: found)
+    monkeypatch.setattr(effect_search, "_without_superfluous", lambda *_: next(superfluous))
+    monkeypatch.setattr(effect_search, "compare_again", lambda *_: (base, [back], {"gravity_load": back}))
+    study = Study({}, Setting(Segmentation(64)))
+    found = effect_search.search_effects(base, study, max_effects=2, catalogue=(), hold="linear")
+    assert found.dropped == ("gravity_load",)
+    (told,) = _named_findings(found.rounds, base.model, 1.0, {"creep": 2.0})
+    assert (told.name, told.p_value) == ("creep", 0.002)

@@ -15,7 +15,7 @@ from fitting.estimation.free_run import FreeRun
 from fitting.estimation.problem import Segmentation
 from fitting.uncertainty.measurement_noise import measurement_noise
 from fitting.uncertainty.prediction_band import PredictionBand
-from fitting.validation.account import Account, account
+from fitting.validation.account import Account, account, of_parameters
 from fitting.validation.free_run_check import over_bands, share_explained, surprise
 
 NOISE, SWING = 1e-6, 1e3
@@ -39,7 +39,7 @@ def fitted() -> tuple[Fit, Account]:
     """A fit and its account; tests replace its free runs."""
     training, selection = split((rig.reduced_experiment(600, noise=2e-3),))
     found = fit(rig.reduced_model(), training, PATHS, Segmentation(128, substeps=2, count=8))
-    return found, account(found, training, selection, noise=found.covariance, halo=0)
+    return found, account(found, training, selection, noise=found.covariance, halo=0, known=of_parameters(found))
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_free_runs_of_the_true_model_agree_with_their_bands(fitted: tuple[Fit, A
     found, known = fitted
     _, selection = split((rig.reduced_experiment(600, noise=2e-3),))
     held_out = replace(found, stretches=tuple(selection))
-    beyond = surprise(found, known.test, held_out, noise=found.covariance, halo=0)
+    beyond = surprise(found, known.test, held_out, of_parameters=known.uncertainty, noise=found.covariance, halo=0)
     assert beyond == pytest.approx(1.0, abs=0.2)
 
 
@@ -121,7 +121,7 @@ def test_free_runs_under_coloured_noise_agree_with_their_bands():
         found.model, selection, PATHS, Segmentation(256, substeps=2, count=16), strategy=Strategy(hold_parameters=True)
     )
     of_pieces = measurement_noise(found).covariance
-    known = account(found, training, selection, noise=of_pieces, halo=0)
+    known = account(found, training, selection, noise=of_pieces, halo=0, known=of_parameters(found))
     assert known.rmse["test"] > 1.3 * np.sqrt(of_pieces[0, 0])
-    beyond = surprise(found, known.test, held_out, noise=of_pieces, halo=0)
+    beyond = surprise(found, known.test, held_out, of_parameters=known.uncertainty, noise=of_pieces, halo=0)
     assert beyond == pytest.approx(1.0, abs=0.15)

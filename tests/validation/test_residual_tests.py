@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -179,3 +181,29 @@ def test_rate_of_the_motion_does_not_depend_on_which_samples_are_valid():
         for own in (experiment, slow)
     )
     assert np.ptp(some.centre) == pytest.approx(np.ptp(every.centre), rel=0.2)
+
+
+def test_spectrum_of_logs_with_two_sample_rates_is_that_of_the_first_rate():
+    """A line of 4 Hz in both logs is one line."""
+    model, segmentation = rig.reduced_model(), Segmentation(128, substeps=2, count=16)
+    steps = (rig.REDUCED_STEP, 3.0 * rig.REDUCED_STEP)
+    logs = [Stretch(rig.reduced_experiment(1000, step=step), 0, 1000) for step in steps]
+    held = Strategy(hold_parameters=True)
+    one, both = (fit(model, some, base_paths(model), segmentation, strategy=held) for some in (logs[:1], logs))
+    one, both = (replace(found, error=_line(found)) for found in (one, both))
+    np.testing.assert_allclose(diagnose(both).spectral_density, diagnose(one).spectral_density)
+    random = np.random.default_rng(9)
+    signal = coloured(random, 0.5)
+    late = random.normal(size=SAMPLES) + 0.2 * np.roll(signal, 4) / np.std(signal)
+    _, test = independence(late - late.mean(), signal - signal.mean(), name="torque", step=None)
+    assert "4 samples later" in test.says
+
+
+def _line(found: Fit) -> jax.Array:
+    """An error of 4 Hz by each log's own clock."""
+    error, length = np.zeros(found.error.shape), found.error.shape[1]
+    ends = np.cumsum(found.pieces)
+    for stretch, end, count in zip(found.stretches, ends, found.pieces, strict=True):
+        time = stretch.experiment.time_step * np.arange(count * length)
+        error[end - count : end, :, 0] = np.sin(8.0 * np.pi * time).reshape(count, length)
+    return jnp.asarray(error)

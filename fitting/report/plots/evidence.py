@@ -15,7 +15,7 @@ def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
 
     Args:
         found: the evidence.
-        units: of its quantity and of its variable, by name.
+        units: of the torque and of its variable, by name.
     """
     cloud = {
         "type": "scatter",
@@ -28,14 +28,13 @@ def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
     }
     layout = {
         "xaxis": axis(axis_label(found.variable, pretty_unit(units[found.variable])), exponentformat="power"),
-        "yaxis": axis(axis_label(found.quantity, pretty_unit(units[found.quantity])), exponentformat="power"),
+        "yaxis": axis(axis_label("torque", pretty_unit(units["torque"])), exponentformat="power"),
     }
-    caption = f"Contribution of {_plain(found.effect)} along the fitted motion."
-    if found.told.size:
-        caption += (
-            " With error bars (95 %): the torque estimated from the data at this place without a law, with all other "
-            "parameters as fitted. Under the right law, the points agree with it."
-        )
+    caption = (
+        f"Contribution of {_plain(found.effect)} along the fitted motion. With error bars (95 %): the torque estimated "
+        "from the data at this place without a law, with all other parameters as fitted. Under the right law, the "
+        "points agree with it."
+    )
     if len(found.told) > 1:
         caption += " The two directions of motion are estimated separately."
     return Plot(
