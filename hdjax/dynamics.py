@@ -308,7 +308,7 @@ class TwoInertiaModel(Model):
         bare drive moves without a torque. What else moves the load counts to the first order.
 
         A filter's lag is a delay and, by its transfer function `exp(lag s) / (1 + lag s)`, terms from the second order
-        on."""
+        on of the delayed motion."""
         ahead = _ahead(effect.load_delay() for effect in self._of(SensorEffect))
         theta_l, omega_l = state[1], state[3]
         if ahead is None:
@@ -320,7 +320,7 @@ class TwoInertiaModel(Model):
         theta_l, omega_l = taylor(moving, ahead), taylor(moving[1:], ahead)
         for effect in self._of(SensorEffect):
             if (lag := effect.load_lag()) is not None:
-                theta_l = theta_l + lag**2 / 2 * moving[2] - lag**3 / 3 * moving[3]
+                theta_l = theta_l + lag**2 / 2 * taylor(moving[2:], ahead) - lag**3 / 3 * moving[3]
                 omega_l = omega_l + lag**2 / 2 * moving[3]
         return theta_l, omega_l
 
