@@ -387,6 +387,11 @@ class TwistModel(Model):
     motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
     measured: ClassVar[tuple[str, ...]] = ("dynamic_error",)  # pyright: ignore[reportIncompatibleVariableOverride]
 
+    def __check_init__(self):
+        for effect in self.effects:
+            if effect.needs_motor:
+                raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
+
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         return Motion(x=state[0], v=state[1], **vars(conditions))
 
@@ -411,11 +416,6 @@ class ReducedModel(TwistModel):
 
     drive: ReducedDrive
     effects: tuple[Effect, ...] = ()
-
-    def __check_init__(self):
-        for effect in self.effects:
-            if effect.needs_motor:
-                raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
 
     def twist_acceleration(self, torque: Array, tau: Array, load_torque: Array) -> Array:
         return self.drive.gain * torque - tau
