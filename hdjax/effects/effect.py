@@ -177,6 +177,11 @@ class Effect(eqx.Module):
         return False
 
     @property
+    def follows_torque(self) -> bool:
+        """Whether it is a function of the motor torque, so that accelerations are not linear in it."""
+        return False
+
+    @property
     def angles(self) -> frozenset[str]:
         """The angles, fields of [`Motion`][], whose position matters to it and not only their rate or twist."""
         return _ANGLES & {self.drawn_against}
