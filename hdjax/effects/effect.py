@@ -143,12 +143,13 @@ class Effect(eqx.Module):
     imperfection: ClassVar[float] = 3e-3
 
     @classmethod
-    @abc.abstractmethod
     def proposals(cls, scales: Scales) -> "tuple[Effect, ...]":
         """The effect at zero strength, with shape parameters for a motion of these scales.
 
         Several proposals are starting points of the same form; none where it is not observable in such a log.
+        One with its default values where not stated.
         """
+        return (cls(),)
 
     @classmethod
     def typical(cls, scales: Scales) -> tuple["Effect", ...]:

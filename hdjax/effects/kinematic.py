@@ -47,10 +47,6 @@ class KinematicError(MeshGeometryEffect):
     )
     sin_4: Scalar = parameter(0.0, unit="rad", doc="sine, order 4", source=SOURCE, plausible=PLAUSIBLE, role="strength")
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     @property
     def _terms(self) -> tuple[Term, ...]:
         return (
