@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hdjax.drive import Drive
 from hdjax.dynamics import TwoInertiaModel
 from hdjax.effects import ActuatorEffect, Effect, Motion, MotorSideEffect, Scales
+from hdjax.effects.kinematic import KinematicHarmonic
 from hdjax.fourier import FourierSeries, fourier_series, harmonic_series
 from hdjax.parameters import Scalar, as_scalar, parameter
 from hdjax.simulate import Trajectory, simulate
@@ -49,7 +50,6 @@ class Feedforward(eqx.Module):
         return self.speed * t + self.correction(t)
 
 
-@eqx.filter_jit
 def feedforward(
     model: TwoInertiaModel,
     speed: ArrayLike,
@@ -71,16 +71,27 @@ def feedforward(
         samples: of a revolution at which forces are evaluated; above twice the harmonics.
 
     Raises:
-        ValueError: an effect has memory, acts on a logged torque, or depends on the output angle.
+        ValueError: an effect has memory, acts on a logged torque, does not repeat with the motor's revolution, or is a
+            function of the motor torque.
     """
     for effect in model.effects:
         if effect.states or isinstance(effect, ActuatorEffect):
             raise ValueError(f"`{effect.name}` has memory or acts on a logged torque: no feedforward can carry it")
         if "theta_l" in effect.angles:
             raise ValueError(f"`{effect.name}` turns with the output: its period is not the motor's revolution")
+        if isinstance(effect, KinematicHarmonic) and not effect.repeats():
+            raise ValueError(f"`{effect.name}` has order {float(effect.n):g}: it does not repeat every revolution")
+        if effect.follows_torque:
+            raise ValueError(f"`{effect.name}` is a function of the motor torque, which is to be found")
     if samples <= 2 * harmonics:
         raise ValueError(f"`samples` must be above {2 * harmonics}, but is {samples}")
-    speed, load_torque = as_scalar(speed), as_scalar(load_torque)
+    return _feedforward(model, as_scalar(speed), as_scalar(load_torque), target, harmonics, samples)
+
+
+@eqx.filter_jit
+def _feedforward(
+    model: TwoInertiaModel, speed: Array, load_torque: Array, target: Target, harmonics: int, samples: int
+) -> Feedforward:
     drive = model.drive
 
     def motion(unknowns: Array, speed: Array) -> tuple[FourierSeries, FourierSeries]:

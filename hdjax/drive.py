@@ -72,7 +72,7 @@ class Drive(eqx.Module):
         return self.K * restoring(x, self.alpha) + self.B_sp * v
 
     def error_forcing(self, T_m: Array, T_l: Array) -> Array:
-        """Forcing of the dynamic error, `F = T_m/(N J_m) - T_l/J_l` [rad/s^2].
+        """Forcing of the dynamic error, `F = k_T T_m/(N J_m) - T_l/J_l` [rad/s^2].
 
         The seed prints `(T_m J_l - T_l J_m)/(N J_m J_l)`, which lacks a factor N on the load torque.
         """

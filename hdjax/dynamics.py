@@ -308,7 +308,7 @@ class TwoInertiaModel(Model):
         bare drive moves without a torque. What else moves the load counts to the first order.
 
         A filter's lag is a delay and, by its transfer function `exp(lag s) / (1 + lag s)`, terms from the second order
-        on."""
+        on of the delayed motion."""
         ahead = _ahead(effect.load_delay() for effect in self._of(SensorEffect))
         theta_l, omega_l = state[1], state[3]
         if ahead is None:
@@ -320,7 +320,7 @@ class TwoInertiaModel(Model):
         theta_l, omega_l = taylor(moving, ahead), taylor(moving[1:], ahead)
         for effect in self._of(SensorEffect):
             if (lag := effect.load_lag()) is not None:
-                theta_l = theta_l + lag**2 / 2 * moving[2] - lag**3 / 3 * moving[3]
+                theta_l = theta_l + lag**2 / 2 * taylor(moving[2:], ahead) - lag**3 / 3 * moving[3]
                 omega_l = omega_l + lag**2 / 2 * moving[3]
         return theta_l, omega_l
 
@@ -387,6 +387,11 @@ class TwistModel(Model):
     motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
     measured: ClassVar[tuple[str, ...]] = ("dynamic_error",)  # pyright: ignore[reportIncompatibleVariableOverride]
 
+    def __check_init__(self):
+        for effect in self.effects:
+            if effect.needs_motor:
+                raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
+
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         return Motion(x=state[0], v=state[1], **vars(conditions))
 
@@ -411,11 +416,6 @@ class ReducedModel(TwistModel):
 
     drive: ReducedDrive
     effects: tuple[Effect, ...] = ()
-
-    def __check_init__(self):
-        for effect in self.effects:
-            if effect.needs_motor:
-                raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
 
     def twist_acceleration(self, torque: Array, tau: Array, load_torque: Array) -> Array:
         return self.drive.gain * torque - tau

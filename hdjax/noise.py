@@ -60,7 +60,7 @@ class WhiteNoise(Noise):
     def error_intensity(self, drive: Drive | ReducedDrive) -> Scalar:
         """Intensity of the noise in the forcing of the dynamic error [rad^2/s^3].
 
-        `S_m/(N J_m)^2 + S_l/J_l^2`, or `gain^2 S_m` of a reduced drive: independent torques add in power.
+        `S_m (k_T/(N J_m))^2 + S_l/J_l^2`, or `gain^2 S_m` of a reduced drive: independent torques add in power.
         """
         motor, load = _error_gains(drive)
         return motor**2 * self.intensity + load**2 * self.load_intensity

@@ -48,9 +48,9 @@ class Trajectory(eqx.Module):
         Raises:
             ValueError: no sensor measures it.
         """
-        if self.measured[-1] != "dynamic_error":
+        if "dynamic_error" not in self.measured:
             raise ValueError(f"the outputs are {', '.join(self.measured)}; give the model `measured` with both angles")
-        return self.outputs[:, -1]
+        return self.outputs[..., self.measured.index("dynamic_error")]
 
 
 def no_torque(t: Array) -> Array:

@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hdjax.dynamics import Model, State
 from hdjax.effects import Conditions
-from hdjax.noise import Noise
+from hdjax.noise import Noise, WhiteNoise
 from hdjax.results import Ending
 from hdjax.signals import PiecewisePolynomial
 from hdjax.simulate import Trajectory, no_torque, raise_failure, read, require_sampled, require_start
@@ -130,16 +131,26 @@ def simulate_noisy(
         The trajectory. Behind the model's states, those under coloured noise show its motor and load torque [N m].
 
     Raises:
-        ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal; where the times
-            do not rise, or the initial state is not one of the model.
+        ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal; where an effect
+            is a function of the motor torque and that is white noise; where the times are fewer than two or do not
+            rise, or the initial state is not one of the model.
         SimulationError: with the [`Ending`][] that names cause and mend.
     """
     require_sampled(model, forcing)
     if substeps < 1:
         raise ValueError(f"`substeps` must be at least 1, but is {substeps}")
+    if isinstance(noise, WhiteNoise):
+        for effect in model.effects:
+            if effect.follows_torque:
+                raise ValueError(
+                    f"`{effect.name}` is a function of the motor torque, which white noise has no value of"
+                )
     times = jnp.asarray(times, dtype=float)
     initial_state = model.rest() if initial_state is None else initial_state
     require_start(model, times, initial_state)
+    # Two equal times have no step between them that noise could act in.
+    if times.size < 2 or not (isinstance(times, Tracer) or np.all(np.diff(times) > 0.0)):
+        raise ValueError("`times` must be two or more, each later than the one before")
     trajectory = _simulate_noisy(
         model,
         noise,

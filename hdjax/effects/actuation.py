@@ -22,10 +22,6 @@ class TorqueBias(ActuatorEffect):
         role="strength",
     )
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.affine(1.0, self.bias)
 
@@ -51,10 +47,6 @@ class TorqueGain(ActuatorEffect):
         plausible=(0.0, 0.1),
         role="strength",
     )
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.affine(1.0 + self.gain_error, 0.0)
@@ -125,10 +117,6 @@ class LoggedTorqueLag(_Lag):
     """
 
     name: ClassVar[str] = "logged_torque_lag"
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.unlagged(self.lag)

@@ -34,10 +34,6 @@ class Backlash(MeshTorqueEffect):
     )
 
     @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
-    @classmethod
     def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
         """The dead zone beyond which a linear spring has the torque and slope of a strongly hardening one."""
         if not float(drive.alpha) * scales.x_max**2 > _HARDEST:

@@ -29,10 +29,6 @@ class Cogging(MotorSideEffect):
     cos_4: Scalar = parameter(0.0, unit="N m", doc="cosine, order 4", source=SOURCE, role="strength")
     sin_4: Scalar = parameter(0.0, unit="N m", doc="sine, order 4", source=SOURCE, role="strength")
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     @property
     def _terms(self) -> tuple[Term, ...]:
         return (1, self.cos_1, self.sin_1), (2, self.cos_2, self.sin_2), (4, self.cos_4, self.sin_4)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
+from hdjax.effects.effect import MeshTorqueEffect, Motion
 from hdjax.parameters import Scalar, parameter
 
 
@@ -18,10 +18,6 @@ class QuadraticDamping(MeshTorqueEffect):
     drawn_against: ClassVar[str | None] = "v"
 
     c2: Scalar = parameter(0.0, unit="N m s^2/rad^2", doc="quadratic damping", source="EFFECTS", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.c2 * motion.v * jnp.abs(motion.v)
@@ -35,10 +31,6 @@ class CubicDamping(MeshTorqueEffect):
     drawn_against: ClassVar[str | None] = "v"
 
     c3: Scalar = parameter(0.0, unit="N m s^3/rad^3", doc="cubic damping", source="EFFECTS", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.c3 * motion.v**3
@@ -58,10 +50,6 @@ class DisplacementDamping(MeshTorqueEffect):
         source="EFFECTS",
         role="strength",
     )
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.c_x * motion.x**2 * motion.v

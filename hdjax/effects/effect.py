@@ -143,12 +143,13 @@ class Effect(eqx.Module):
     imperfection: ClassVar[float] = 3e-3
 
     @classmethod
-    @abc.abstractmethod
     def proposals(cls, scales: Scales) -> "tuple[Effect, ...]":
         """The effect at zero strength, with shape parameters for a motion of these scales.
 
         Several proposals are starting points of the same form; none where it is not observable in such a log.
+        One with its default values where not stated.
         """
+        return (cls(),)
 
     @classmethod
     def typical(cls, scales: Scales) -> tuple["Effect", ...]:
@@ -174,6 +175,11 @@ class Effect(eqx.Module):
     @property
     def needs_temperature(self) -> bool:
         """Whether it depends on the drive's temperature."""
+        return False
+
+    @property
+    def follows_torque(self) -> bool:
+        """Whether it is a function of the motor torque, so that accelerations are not linear in it."""
         return False
 
     @property

@@ -72,10 +72,6 @@ class _Viscous(ShaftEffect):
 
     b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     @staticmethod
     @abc.abstractmethod
     def rate_of(motion: Motion) -> Array:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales, ShaftEffect
+from hdjax.effects.effect import LoadSideEffect, Motion, MotorSideEffect, ShaftEffect
 from hdjax.parameters import Scalar, parameter
 
 
@@ -22,10 +22,6 @@ class _InertiaError(ShaftEffect):
         plausible=(0.0, 0.5),
         role="strength",
     )
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return jnp.zeros_like(drive.J_l)

@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+from jax.core import Tracer
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
@@ -19,7 +20,7 @@ from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Ghorbel, Gandhi, Alpeter 2001; vendors: 1.5e-4 to 5.8e-4 rad peak to peak"
 PLAUSIBLE = (0.0, 2.9e-4)
-# Deviation of a fitted order from a whole number (assumed).
+# Deviation of a stated order from a whole number (assumed).
 _WHOLE = 1e-3
 
 
@@ -45,10 +46,6 @@ class KinematicError(MeshGeometryEffect):
         0.0, unit="rad", doc="cosine, order 4", source=SOURCE, plausible=PLAUSIBLE, role="strength"
     )
     sin_4: Scalar = parameter(0.0, unit="rad", doc="sine, order 4", source=SOURCE, plausible=PLAUSIBLE, role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     @property
     def _terms(self) -> tuple[Term, ...]:
@@ -83,7 +80,10 @@ class KinematicHarmonic(MeshGeometryEffect):
         return tuple(cls(n=n) for n in (6.0, 3.0, 8.0, 5.0, 10.0, 12.0))
 
     def repeats(self) -> bool:
-        """Whether its order is whole, up to the accuracy of a fit, so that it repeats with the motor's revolution."""
+        """Whether its order is whole, up to rounding in a file, so that it repeats with the motor's revolution. True
+        inside a transformation, where the order is not known."""
+        if isinstance(self.n, Tracer):
+            return True
         return float(self.n) > 0.5 and abs(float(self.n) - round(float(self.n))) < _WHOLE
 
     def error(self, theta_m: Array) -> Array:

@@ -77,6 +77,10 @@ class Learned(Effect):
         return any(axis.variable == "temperature" for axis in self.axes)
 
     @property
+    def follows_torque(self) -> bool:
+        return any(axis.variable == "T_m" for axis in self.axes)
+
+    @property
     def angles(self) -> frozenset[str]:
         return frozenset(axis.variable for axis in self.axes if axis.variable in ANGLES)
 

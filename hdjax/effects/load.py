@@ -26,10 +26,6 @@ class GravityLoad(LoadSideEffect):
     sine: Scalar = parameter(0.0, unit="N m", doc="m g r cos(phi)", source="EFFECTS", role="strength")
     cosine: Scalar = parameter(0.0, unit="N m", doc="m g r sin(phi)", source="EFFECTS", role="strength")
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         assert motion.theta_l is not None
         return -ripple(motion.theta_l, 1, self.cosine, self.sine)
@@ -49,10 +45,6 @@ class ConstantLoad(LoadSideEffect):
     drawn_against: ClassVar[str | None] = None
 
     constant: Scalar = parameter(0.0, unit="N m", doc="along +theta_l", source="EFFECTS", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return self.constant

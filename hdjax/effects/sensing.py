@@ -29,10 +29,6 @@ class EncoderOffset(SensorEffect):
         role="strength",
     )
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l + self.offset
 
@@ -44,10 +40,6 @@ class JointTorqueBias(SensorEffect):
     name: ClassVar[str] = "joint_torque_bias"
 
     bias: Scalar = parameter(0.0, unit="N m", doc="reading of the sensor without a torque", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque_reading(self, tau: Array) -> Array:
         return tau + self.bias
@@ -182,10 +174,6 @@ class LoadEncoderDelay(SensorDelay):
     of_load: ClassVar[int] = 1
     of_torque: ClassVar[int] = 0
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
 
 class LoadEncoderLag(LoadEncoderDelay):
     """The load's sensors read `y` of `delay y' + y = theta_l`, as behind a filter: slow motions are read late by
@@ -203,7 +191,3 @@ class JointTorqueDelay(SensorDelay):
     name: ClassVar[str] = "joint_torque_delay"
     of_load: ClassVar[int] = 0
     of_torque: ClassVar[int] = 1
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)

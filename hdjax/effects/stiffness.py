@@ -18,10 +18,6 @@ class QuadraticStiffness(MeshTorqueEffect):
 
     k2: Scalar = parameter(0.0, unit="1/rad", doc="quadratic stiffness over K", source="EFFECTS", role="strength")
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return drive.stiffness * self.k2 * motion.x**2
 
@@ -33,10 +29,6 @@ class QuinticStiffness(MeshTorqueEffect):
     name: ClassVar[str] = "quintic_stiffness"
 
     k5: Scalar = parameter(0.0, unit="rad^-4", doc="quintic stiffness over K", source="EFFECTS", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return drive.stiffness * self.k5 * motion.x**5

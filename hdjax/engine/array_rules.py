@@ -28,14 +28,25 @@ def constants(graph: Graph, array: Any) -> Nodes:
     if array.dtype != bool and not np.issubdtype(array.dtype, np.number):
         raise UntranslatableError(f"a constant of type {array.dtype}")
     found = np.empty(array.shape, dtype=object)
+    if array.ndim == 0:
+        found[()] = _constant(graph, array.item())
+        return found
     for index in np.ndindex(array.shape):
-        value = array[index].item()
-        found[index] = graph.constant(value if isinstance(value, bool) else float(value))
+        found[index] = _constant(graph, array[index].item())
     return found
+
+
+def _constant(graph: Graph, value: Any) -> Node:
+    return graph.constant(value if isinstance(value, bool) else float(value))
 
 
 def each(rule: Callable[..., Node], *arguments: Nodes) -> Nodes:
     """Apply a rule entry by entry."""
+    # Most equations are of scalars.
+    if all(a.ndim == 0 for a in arguments):
+        single = np.empty((), dtype=object)
+        single[()] = rule(*(a.item() for a in arguments))
+        return single
     arrays = np.broadcast_arrays(*arguments) if len(arguments) > 1 else list(arguments)
     found = np.empty(arrays[0].shape, dtype=object)
     for index in np.ndindex(found.shape):

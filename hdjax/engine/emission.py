@@ -297,24 +297,26 @@ def _instruction(v: Vectors, graph: Graph, node: Node, x: list[ir.Value]) -> ir.
         return v.called(_INTRINSIC[operation], *x)
     if operation in _OWN:
         return own_function(v, operation, _OWN[operation], *x)
-    simple: dict[str, Callable[..., ir.Value]] = {
-        "div": b.fdiv,
-        "neg": b.fneg,
-        "select": b.select,
-        "max": lambda p, q: b.select(b.fcmp_ordered(">", p, q), p, q),
-        "min": lambda p, q: b.select(b.fcmp_ordered("<", p, q), p, q),
-        "and": b.and_,
-        "or": b.or_,
-        "xor": b.xor,
-        "not": b.not_,
-        "given": lambda p: p,
-        "sign": lambda p: _sign(v, p),
-        "is_finite": lambda p: v.smaller(v.called("fabs", p), v.number(math.inf)),
-    }
-    return simple[operation](*x)
+    return _SIMPLE[operation](v, *x)
 
 
 def _sign(v: Vectors, x: ir.Value) -> ir.Value:
     zero = v.number(0.0)
     negative = v.builder.select(v.smaller(x, zero), v.number(-1.0), x)
     return v.builder.select(v.smaller(zero, x), v.number(1.0), negative)
+
+
+_SIMPLE: dict[str, Callable[..., ir.Value]] = {
+    "div": lambda v, p, q: v.builder.fdiv(p, q),
+    "neg": lambda v, p: v.builder.fneg(p),
+    "select": lambda v, which, p, q: v.builder.select(which, p, q),
+    "max": lambda v, p, q: v.builder.select(v.builder.fcmp_ordered(">", p, q), p, q),
+    "min": lambda v, p, q: v.builder.select(v.builder.fcmp_ordered("<", p, q), p, q),
+    "and": lambda v, p, q: v.builder.and_(p, q),
+    "or": lambda v, p, q: v.builder.or_(p, q),
+    "xor": lambda v, p, q: v.builder.xor(p, q),
+    "not": lambda v, p: v.builder.not_(p),
+    "given": lambda v, p: p,
+    "sign": _sign,
+    "is_finite": lambda v, p: v.smaller(v.called("fabs", p), v.number(math.inf)),
+}

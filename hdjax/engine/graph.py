@@ -166,8 +166,26 @@ class Graph:
         """Values of nodes for leaves that are numbers or arrays of one shape: no compilation, one numpy call per
         node."""
         value: dict[Node, Any] = {}
+        self.add_values(value, self.needed(wanted), leaves)
+        return [value[node] for node in wanted]
+
+    def add_values(
+        self,
+        value: dict[Node, Any],
+        nodes: Iterable[Node],
+        leaves: Mapping[Hashable, Any],
+        past: Mapping[Node, Iterable[Node]] = {},
+    ) -> None:
+        """Likewise add the values of nodes to those of their arguments, in order.
+
+        Args:
+            value: receives the values.
+            nodes: to evaluate.
+            leaves: numbers or arrays.
+            past: after which nodes which others are no longer needed: their memory is used again, from the cache.
+        """
         with np.errstate(all="ignore"):
-            for node in self.needed(wanted):
+            for node in nodes:
                 operation, *rest = self.nodes[node]
                 if operation == "constant":
                     value[node] = rest[0]
@@ -178,7 +196,8 @@ class Graph:
                     value[node] = sum(leaves[name] * value[factor] for name, factor in pairs)
                 else:
                     value[node] = _OPERATIONS[operation](*(value[a] for a in self.arguments(node)))
-        return [value[node] for node in wanted]
+                for other in past.get(node, ()):
+                    del value[other]
 
     def _make(self, node: tuple[Any, ...], key: tuple[Hashable, ...], level: int) -> Node:
         if key not in self._found:

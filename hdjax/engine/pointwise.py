@@ -33,6 +33,9 @@ class _Formula:
         shapes: of these arrays.
         values: their entries, concatenated.
         slopes: derivatives of each entry by the entries of the first argument.
+        steady: nodes that values or slopes depend on and that are the same at all instants, in order.
+        moving: the others of them, likewise.
+        past: after which of these which others are no longer needed.
     """
 
     graph: Graph
@@ -40,6 +43,9 @@ class _Formula:
     shapes: tuple[tuple[int, ...], ...]
     values: tuple[Node, ...]
     slopes: tuple[Tangent, ...]
+    steady: tuple[Node, ...]
+    moving: tuple[Node, ...]
+    past: dict[Node, list[Node]]
 
 
 _FORMULAS: dict[Hashable, _Formula | None] = {}
@@ -123,7 +129,20 @@ def _formula(joined: Callable[..., Any], leaves: Sequence[tuple[np.ndarray, int]
     seeds = {node: {i: graph.constant(1.0)} for own in nodes[:moved] for i, node in enumerate(own.reshape(-1))}
     tangents = derivatives(graph, values, seeds) if moved else dict.fromkeys(values, {})
     shapes = tuple(array.shape for array in found)
-    return _Formula(graph, results[0], shapes, tuple(values), tuple(tangents[v] for v in values))
+    slopes = tuple(tangents[v] for v in values)
+    needed = graph.needed([n for t in slopes for n in t.values()] if moved else values)
+    steady, moving = (tuple(n for n in needed if (graph.level[n] == VARYING) == moves) for moves in (False, True))
+    wanted = [n for t in slopes for n in t.values()] if moved else values
+    return _Formula(graph, results[0], shapes, tuple(values), slopes, steady, moving, _past(graph, moving, wanted))
+
+
+def _past(graph: Graph, nodes: Sequence[Node], kept: Sequence[Node]) -> dict[Node, list[Node]]:
+    """By node, those of its arguments at instants that no later one of the nodes needs."""
+    seen, found = {*kept}, {}
+    for node in reversed(nodes):
+        found[node] = [a for a in {*graph.arguments(node)} if a not in seen and graph.level[a] == VARYING]
+        seen.update(found[node])
+    return found
 
 
 def _evaluated(formula: _Formula, leaves: Sequence[tuple[np.ndarray, int]], directions: int | None) -> Any:
@@ -137,12 +156,16 @@ def _evaluated(formula: _Formula, leaves: Sequence[tuple[np.ndarray, int]], dire
     # A single instant is an axis of one.
     some = lead or (1,)
     found = np.zeros((len(formula.values) * (1 if directions is None else directions), *some))
+    same: dict[Node, Any] = {}
+    formula.graph.add_values(same, formula.steady, {i: a for i, (a, axes) in enumerate(entries) if not axes})
     for piece in _pieces(some):
         # An axis of one broadcasts.
         pieces = (a[..., piece] if axes and a.shape[-1] > 1 else a for a, axes in entries)
         here: dict[Hashable, Any] = dict(enumerate(pieces))
-        for row, value in zip(nodes, formula.graph.evaluate(list(nodes.values()), here), strict=True):
-            found[row, ..., piece] = value
+        value = same.copy()
+        formula.graph.add_values(value, formula.moving, here, formula.past)
+        for row, node in nodes.items():
+            found[row, ..., piece] = value[node]
     last = () if directions is None else (directions,)
     arrays, start = [], 0
     for shape in formula.shapes:

@@ -252,6 +252,6 @@ class _Block:
         for i, value in enumerate(after):
             c.store(value, self.ends, i)
         peak = c.load(self.peak, 0)
-        # A motion that has become NaN stays NaN.
+        # x shows whether the motion is lost; the peak need not.
         grows = c.builder.fcmp_unordered(">", largest, peak)
         c.store(c.builder.select(grows, largest, peak), self.peak, 0)

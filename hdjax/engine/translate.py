@@ -82,13 +82,16 @@ def _with_own_derivative(
     graph: Graph, parameters: dict[str, Any], arguments: list[Nodes], values_only: bool
 ) -> list[Nodes]:
     """A function with a custom rule of differentiation."""
-    values = translated(graph, parameters["call_jaxpr"], arguments, values_only=values_only)
+    # Inner rules would not be used: this one has all derivatives.
+    values = translated(graph, parameters["call_jaxpr"], arguments, values_only=True)
     if values_only:
         return values
     entries = [(k, index) for k, a in enumerate(arguments) for index in np.ndindex(a.shape)]
     moving = [e for e in entries if graph.known(arguments[e[0]].item(*e[1])) is None]
     if not moving:
         return values
+    if parameters.get("num_consts", 0):
+        raise UntranslatableError("a function with its own derivative that captures arrays")
     rule, constants, zeros = parameters["jvp_jaxpr_fun"].call_wrapped(*(False for _ in arguments))
     # The rule is linear in the tangents: its derivatives by them are the partial derivatives.
     tangents = [np.full(a.shape, graph.constant(0.0), dtype=object) for a in arguments]
@@ -108,7 +111,7 @@ def _with_own_derivative(
         for place in np.ndindex(value.shape):
             own = {} if change is None else partials[change.item(*place)]
             given = [n for (k, index), slope in own.items() for n in (arguments[k].item(*index), slope)]
-            result[place] = graph.apply("given", value.item(*place), *given) if given else value[place]
+            result[place] = graph.apply("given", value.item(*place), *given)
         results.append(result)
     return results
 

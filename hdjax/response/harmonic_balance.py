@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hdjax.dynamics import Model, TwoInertiaModel
 from hdjax.effects import ActuatorEffect
+from hdjax.effects.kinematic import KinematicHarmonic
 from hdjax.fourier import FourierSeries
 from hdjax.parameters import as_scalar
 
@@ -221,6 +222,8 @@ def balance(
             )
         if rotating and "theta_l" in effect.angles:
             raise ValueError(f"`{effect.name}` turns with the output: its period is not the motor's revolution")
+        if rotating and isinstance(effect, KinematicHarmonic) and not effect.repeats():
+            raise ValueError(f"`{effect.name}` has order {float(effect.n):g}: it does not repeat every revolution")
     if rotating and not isinstance(model, TwoInertiaModel):
         raise ValueError("`rotating` needs a TwoInertiaModel: a reduced drive has no motor angle")
     nothing = FourierSeries(1.0, jnp.zeros(()), jnp.zeros(1), jnp.zeros(1))

@@ -205,16 +205,18 @@ def largest(motion: FourierSeries) -> Float[np.ndarray, "*motions"]:
     """[`FourierSeries.largest`][hdjax.fourier.FourierSeries.largest] without compilation: the largest magnitudes over a
     period, between samples too."""
     z = np.asarray(motion.cosine) - 1j * np.asarray(motion.sine)
-    return _largest_of(np.asarray(motion.mean), z, np.arange(1, motion.harmonics + 1))
+    return _largest_of(np.asarray(motion.mean), z, 1)
 
 
 def largest_of(waves: np.ndarray) -> Float[np.ndarray, "*motions"]:
     """The same of odd harmonics alone, as complex numbers z of `Re(z exp(i k omega t))` along the last axis."""
-    return _largest_of(np.zeros(waves.shape[:-1]), waves, np.arange(1, 2 * waves.shape[-1], 2))
+    return _largest_of(np.zeros(waves.shape[:-1]), waves, 2)
 
 
-def _largest_of(mean: np.ndarray, z: np.ndarray, orders: np.ndarray) -> np.ndarray:
-    count, between = 8 * (orders[-1] + 1), orders[-1] - orders[-2]
+def _largest_of(mean: np.ndarray, z: np.ndarray, between: int) -> np.ndarray:
+    """The same of a mean and every order from one on, or every other."""
+    orders = 1 + between * np.arange(z.shape[-1])
+    count = 8 * (orders[-1] + 1)
     step = 2 * np.pi / count
     t = np.broadcast_to(np.arange(count) * step, (*z.shape[:-1], count))
 

@@ -117,14 +117,14 @@ class Case(eqx.Module):
             if path not in known:
                 raise ValueError(f"`{path}` is no parameter of this sweep; there are {', '.join(known)}")
         limits = {path: info.bounds for path, (_, info) in parameters.items()}
-        if request.response == "steady" or request.periods is not None:
+        fixed = {path: value for path, (value, _) in parameters.items()}
+        if hasattr(self.forcing, "omega") and (request.response == "steady" or request.periods is not None):
             limits[FORCING + "omega"] = (0.0, math.inf)
+            fixed[FORCING + "omega"] = self.forcing.omega  # pyright: ignore[reportFunctionMemberAccess]
         for path, (low, high) in limits.items():
             values = points.column(path)
-            if path in parameters and values is None:
-                values = np.atleast_1d(parameters[path][0])
             if values is None:
-                continue
+                values = np.atleast_1d(fixed[path])
             inside = (values > low) & (values < high)
             if path in parameters and "." in path:
                 # An effect may be swept from its absence, the end of its interval.

@@ -88,6 +88,26 @@ def test_load_encoder_delay_reads_the_earlier_state():
     np.testing.assert_allclose(read.outputs(state), earlier[[1, 3]], rtol=0, atol=3e-3 * moved.max())
 
 
+@pytest.mark.parametrize("moved", [0.0, 0.5])
+def test_load_encoder_lag_errs_by_the_fourth_order_of_a_sine(moved: float):
+    """Against the exact low-pass of the free oscillation, part of which a log's readings have been moved by."""
+    model = TwoInertiaModel(eqx.tree_at(lambda d: d.K, MODEL.drive, jnp.asarray(rig.K)))
+    omega = float(model.drive.omega_0)
+    x = 1e-3 * np.exp(0.7j)
+    load = -rig.K / (rig.J_L * omega**2) * x
+    angles = np.array([rig.N * (x + load), load])
+    state = jnp.asarray(np.real(np.concatenate([angles, 1j * omega * angles])))
+
+    def error(turn: float) -> float:
+        lag = turn / omega
+        lagged = TwoInertiaModel(model.drive, (LoadEncoderLag(delay=lag, moved=moved * lag),), ("load_angle",))
+        exact = load * np.exp(1j * moved * turn) / (1.0 + 1j * turn)
+        return abs(float(lagged.outputs(state)[0]) - exact.real)
+
+    assert error(0.02) < 1e-3 * abs(load) * 0.02**2
+    assert error(0.02) / error(0.01) == pytest.approx(16.0, rel=0.1)
+
+
 @pytest.mark.parametrize("turn", [0.02, 0.1])
 def test_joint_torque_delay_reads_the_earlier_torque(turn: float):
     """Against the motion of a drive with friction under a torque, integrated backwards in time."""

@@ -104,3 +104,40 @@ def test_hidden_states_along_a_ramp_agree_with_the_closed_form(by_machine_code: 
     decay, ramp = np.exp(-t / tau), speed[:, None, None] * t
     expected = ramp - speed[:, None, None] * tau * (1.0 - decay) + 1e-3 * decay
     np.testing.assert_allclose(found[..., 0], expected, rtol=1e-6, atol=1e-9)
+
+
+@jax.custom_jvp
+def still(x):
+    """A function whose own rule says that it does not change."""
+    return x**2
+
+
+@still.defjvp
+def _(points, tangents):
+    return still(*points), jnp.zeros_like(tangents[0])
+
+
+WEIGHTS = jnp.arange(3.0)
+
+
+@jax.custom_jvp
+def weighted(x):
+    """A function that captures an array."""
+    return x * jnp.sum(WEIGHTS)
+
+
+@weighted.defjvp
+def _(points, tangents):
+    return weighted(*points), 2.0 * tangents[0] * jnp.sum(WEIGHTS)
+
+
+@pytest.mark.parametrize(("function", "slope"), [(still, 0.0), (weighted, 6.0)])
+def test_rule_of_a_function_decides_its_slope(function, slope: float):
+    """Also where it captures arrays, so that it can't be translated."""
+
+    def scaled(strengths, x):
+        return function(strengths[0] * x)
+
+    x = np.array([1.0, -3.0])
+    found = slopes_at_instants(scaled, (np.array([2.0]), 0), (x, 1))
+    np.testing.assert_allclose(found[:, 0], slope * x)

@@ -15,7 +15,7 @@ from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import MotorFriction, ViscousLoadFriction
 from hdjax.effects.hysteresis import BoucWen
-from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic
 from hdjax.effects.load import ConstantLoad, GravityLoad
 from hdjax.effects.stiffness import QuadraticStiffness
 from hdjax.fourier import FourierSeries, harmonic_series
@@ -241,6 +241,8 @@ def test_unsupported_models_and_settings_are_refused():
         balance(plain.with_effects(TorqueBias()))
     with pytest.raises(ValueError, match="`gravity_load` turns with the output"):
         balance(whole.with_effects(GravityLoad()), rotating=True)
+    with pytest.raises(ValueError, match="`kinematic_harmonic` has order 2.5"):
+        balance(whole.with_effects(KinematicHarmonic(cosine=1e-4, n=2.5)), rotating=True)
     with pytest.raises(ValueError, match="`rotating` needs a TwoInertiaModel"):
         balance(plain, rotating=True)
     with pytest.raises(ValueError, match="`samples` must be above 18, but is 18"):

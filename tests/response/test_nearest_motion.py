@@ -8,7 +8,7 @@ from orbits import duffing_rates, duffing_slope, multipliers, period_error
 
 from hdjax import ReducedDrive
 from hdjax.fourier import FourierSeries
-from hdjax.response.nearest_motion import NearestMotions, nearest_motions
+from hdjax.response.nearest_motion import NearestMotions, largest, largest_of, nearest_motions
 
 MU, ALPHA, A = 0.05, 1.0, 6.0
 # At 3.6: the lower and the upper branch, a sub-harmonic, and beside the unstable branch; at 40 is one motion alone.
@@ -47,3 +47,9 @@ def test_nearest_motions_lie_on_the_expected_branches(found):
 
 def test_nearest_motion_size_is_the_largest_twist(found):
     np.testing.assert_allclose(found.size, jax.vmap(FourierSeries.largest)(found.motion), rtol=0.01)
+
+
+def test_largest_of_a_single_harmonic_is_its_amplitude():
+    single = FourierSeries(jnp.ones(()), jnp.asarray(0.5), jnp.asarray([3.0]), jnp.asarray([4.0]))
+    assert largest(single) == pytest.approx(5.5)
+    assert largest_of(np.array([3.0 - 4.0j])) == pytest.approx(5.0)

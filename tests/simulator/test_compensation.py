@@ -12,7 +12,9 @@ from hdjax.dynamics import TwoInertiaModel
 from hdjax.effects.actuation import TorqueGain
 from hdjax.effects.friction import LoadFriction
 from hdjax.effects.hysteresis import BoucWen
-from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic
+from hdjax.effects.learned import LearnedMotorTorque
+from hdjax.effects.learned_axes import PowerAxis
 from hdjax.effects.load import GravityLoad
 from hdjax.simulate import Trajectory
 
@@ -121,5 +123,10 @@ def test_feedforward_refuses_what_it_can_not_carry_and_few_samples():
     for effect in (BoucWen(k=500.0, memory_twist=1e-4), TorqueGain(gain_error=0.1), GravityLoad(sine=1.0)):
         with pytest.raises(ValueError, match=effect.name):
             feedforward(PLANT.with_effects(effect), 60.0)
+    with pytest.raises(ValueError, match="`kinematic_harmonic` has order 2.5"):
+        feedforward(PLANT.with_effects(KinematicHarmonic(cosine=1e-4, n=2.5)), 60.0)
+    learned = LearnedMotorTorque(axes=(PowerAxis("T_m", 1.0),), mixing=np.ones((5, 1)), c=(0.1,))
+    with pytest.raises(ValueError, match="`learned_motor_torque` is a function of the motor torque"):
+        feedforward(PLANT.with_effects(learned), 60.0)
     with pytest.raises(ValueError, match="samples"):
         feedforward(PLANT, 60.0, harmonics=12, samples=24)

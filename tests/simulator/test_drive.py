@@ -10,7 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdjax import PRESETS, Drive, ReducedDrive, ReducedModel, TwoInertiaModel, hdc_40_050
+from hdjax import (
+    PRESETS,
+    Drive,
+    LoadDrivenModel,
+    MotorDrivenModel,
+    ReducedDrive,
+    ReducedModel,
+    TwoInertiaModel,
+    hdc_40_050,
+)
 from hdjax.effects import BY_NAME, CATALOGUE, FAMILIES, Scales
 from hdjax.effects.backlash import Backlash
 from hdjax.effects.creep import Creep
@@ -233,6 +242,12 @@ def test_reduced_drive_refuses_effects_that_need_the_motor(form):
         ReducedModel(drive, (effect,))
     with pytest.raises(ValueError, match=f"`{form.name}` needs the motor"):
         ReducedModel(drive).with_effects(effect)
+
+
+@pytest.mark.parametrize("side", [MotorDrivenModel, LoadDrivenModel])
+def test_equation_of_one_side_refuses_effects_that_need_the_motor(side):
+    with pytest.raises(ValueError, match="`kinematic_error` needs the motor"):
+        side(hdc_40_050()).with_effects(KinematicError())
 
 
 def test_parameters_are_converted_to_arrays():

@@ -26,7 +26,7 @@ from hdjax import (
     simulate,
 )
 from hdjax.effects.actuation import TorqueBias
-from hdjax.simulate import march
+from hdjax.simulate import Trajectory, march
 
 MU, OMEGA_0, GAIN = 3.0, 50.0, 2.0
 TIMES = np.linspace(0.2, 0.7, 101)  # a start that is not zero
@@ -410,3 +410,12 @@ def test_trajectory_has_consistent_fields():
     assert found.states.shape == (TIMES.size, 2)
     np.testing.assert_allclose(found.states[0], REST, atol=1e-12)
     np.testing.assert_array_equal(found.dynamic_error, found.states[:, 0])
+
+
+def test_dynamic_error_is_found_among_other_outputs():
+    outputs = jnp.asarray(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    measured = ("motor_turn", "dynamic_error", "joint_torque")
+    found = Trajectory(jnp.arange(2.0), outputs, outputs, jnp.asarray(0), measured)
+    np.testing.assert_array_equal(found.dynamic_error, [2.0, 5.0])
+    with pytest.raises(ValueError, match="the outputs are motor_turn; "):
+        _ = Trajectory(jnp.arange(2.0), outputs, outputs[:, :1], jnp.asarray(0), measured[:1]).dynamic_error

@@ -23,6 +23,8 @@ from hdjax import (
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.learned import LearnedMotorTorque
+from hdjax.effects.learned_axes import PowerAxis
 from hdjax.noise import ColouredNoise, WhiteNoise
 from hdjax.stationary import coloured_variance, stationary_variance
 from hdjax.stochastic import AdditiveRK4, simulate_noisy
@@ -266,3 +268,9 @@ def test_invalid_arguments_of_a_noisy_simulation_are_refused():
         simulate_noisy(model, white(S), TIMES, KEYS[0], substeps=0)
     with pytest.raises(ValueError, match="`forcing` must be a sampled signal for .*torque_bias"):
         simulate_noisy(model.with_effects(TorqueBias(bias=1.0)), white(S), TIMES, KEYS[0])
+    learned = LearnedMotorTorque(axes=(PowerAxis("T_m", 1.0),), mixing=np.ones((5, 1)), c=(0.1,))
+    with pytest.raises(ValueError, match="`learned_motor_torque` is a function of the motor torque"):
+        simulate_noisy(TwoInertiaModel(hdc_40_050(), (learned,)), white(S), TIMES, KEYS[0])
+    for times in ([0.0], [0.0, 0.1, 0.1]):
+        with pytest.raises(ValueError, match="`times` must be two or more"):
+            simulate_noisy(model, white(S), np.array(times), KEYS[0])

@@ -73,6 +73,14 @@ def test_steady_motion_between_the_folds_is_unstable():
     assert not found.stable[several, 1].any() and found.stable[several][:, [0, 2]].all()
 
 
+@pytest.mark.parametrize("omega", [0.0, -1.0])
+@pytest.mark.parametrize("settings", [{}, {"response": "transient", "outputs": ("peak",), "periods": 3.0}])
+def test_fixed_frequency_that_is_not_positive_is_refused(settings, omega):
+    request = Request(Points({"alpha": np.array([0.0, 0.5])}), **settings)
+    with pytest.raises(ValueError, match="`forcing.omega` must lie between 0 and inf"):
+        Case(case().model, Harmonic(0.3, omega)).require(request)
+
+
 def test_harmonic_phases_follow_the_phase_of_the_forcing():
     request = Request(Points({"forcing.phase": np.array([0.0, 0.7]), "forcing.omega": np.array([0.6, 1.9])}))
     request = Request(request.points, outputs=("harmonics",))
