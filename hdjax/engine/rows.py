@@ -70,8 +70,8 @@ def _record_tangents(
             white = c.total([c.mul(w, x) for w, x in zip(whitening[p], change, strict=True)])
             assert white is not None
             c.store(room.finite(white, inside[p]), _columns_of(room, p), t)
-    rows = [c.plus(c.times(i, m.outputs), p) for p in range(m.outputs)]
-    _put_rows(room, rows, [_columns_of(room, p) for p in range(m.outputs)], values)
+    for p in range(m.outputs):
+        _put_row(room, c.plus(c.times(i, m.outputs), p), _columns_of(room, p), values[p])
 
 
 def _columns_of(room: Room, row: int) -> ir.Value:
@@ -79,24 +79,19 @@ def _columns_of(room: Room, row: int) -> ir.Value:
     return room.code.place(room.collected, row * (room.tangents + 1))
 
 
-def _put_rows(room: Room, rows: Sequence[ir.Value], columns: Sequence[ir.Value], values: Sequence[ir.Value]) -> None:
-    """Write rows of the Jacobian, or add them to the products of the columns with each other."""
+def _put_row(room: Room, row: ir.Value, columns: ir.Value, value: ir.Value) -> None:
+    """Write a row of the Jacobian, or add it to the products of the columns with each other."""
     c, b = room.code, room.code.builder
-    for own, value in zip(columns, values, strict=True):
-        c.store(value, own, room.tangents)
+    c.store(value, columns, room.tangents)
     with b.if_else(room.wants("jacobian")) as (written, taken):
         with taken, c.loop(room.tangents + 1, room.first_moving()) as i:
-            left = [c.load(own, i) for own in columns]
-            # One pass for all rows: the products are many, and take longest to read and write.
+            left = c.load(columns, i)
             with c.loop(room.tangents + 1, i) as j:
                 place = c.plus(c.times(i, room.tangents + 1), j)
-                total = c.load(room.products, place)
-                for factor, own in zip(left, columns, strict=True):
-                    total = c.add(total, c.mul(factor, c.load(own, j)))
-                c.store(total, room.products, place)
+                product = c.mul(left, c.load(columns, j))
+                c.store(c.add(c.load(room.products, place), product), room.products, place)
         with written:
-            for row, own in zip(rows, columns, strict=True):
-                _write_row(room, row, own)
+            _write_row(room, row, columns)
 
 
 def _write_row(room: Room, row: ir.Value, columns: ir.Value) -> None:
@@ -167,7 +162,7 @@ def write_prior(room: Room) -> None:
                 change = room.node(m.expected, slopes["state", t - m.parameters], room.prior_results)
             change = c.mul(change, c.load(room.scale, t))
             c.store(room.finite(change, both), _columns_of(room, 0), t)
-        _put_rows(room, [row], [_columns_of(room, 0)], [value])
+        _put_row(room, row, _columns_of(room, 0), value)
 
 
 def write_end(room: Room) -> None:
