@@ -6,7 +6,7 @@ import mutations
 import pytest
 
 from fitting.drive_data import read_rig
-from fitting.errors import InputError
+from fitting.errors import DataError, InputError
 
 
 def write(folder: Path, name: str, seed: int) -> Path:
@@ -46,3 +46,12 @@ def test_numbers_of_names_are_those_of_no_file(tmp_path: Path, drive: Path):
 def test_logs_of_two_kinds_are_refused(tmp_path: Path, drive: Path):
     with pytest.raises(InputError, match="can't be fitted together"):
         read_rig([write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 4)], drive)
+
+
+def test_test_log_that_is_unfit_is_refused(tmp_path: Path, drive: Path):
+    fitted, test = write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 1)
+    name, *rows = test.read_text(encoding="utf-8").splitlines()
+    mirrored = [",".join([t, m, str(-float(load)), torque]) for t, m, load, torque in (row.split(",") for row in rows)]
+    test.write_text("\n".join([name, *mirrored]), encoding="utf-8")
+    with pytest.raises(DataError, match=r"b\.csv: .* sign = -1"):
+        read_rig([fitted], drive, test=[test])
