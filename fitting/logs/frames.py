@@ -9,8 +9,9 @@ import numpy as np
 import polars as pl
 
 from fitting.errors import InputError
+from fitting.logs.column_names import unit_in_name
 from fitting.logs.parquet import column_from_series
-from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of, unit_in_name
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of
 
 
 def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:

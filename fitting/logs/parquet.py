@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of, unit_in_name
+from fitting.logs.column_names import unit_in_name
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of
 from fitting.logs.text_cells import column_from_text
 
 

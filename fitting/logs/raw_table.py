@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from fitting.errors import InputError
-from fitting.logs.units import is_unit
 
 DATE = r"(?:[0-9./-]+|[0-9]{1,2}[ ./-][A-Za-z]{3,9}[ ./-][0-9]{2,4}|[A-Za-z]{3,9}\.? [0-9]{1,2}[,.]? [0-9]{4})"
 """Pattern of a date before a time of day, in numbers or with the name of the month."""
@@ -86,14 +85,3 @@ def split_unit(name: str) -> tuple[str, str | None]:
     """A header such as "torque [N m]" or "time (ms)" as name and unit; None without a unit."""
     match = re.fullmatch(r"\s*(.+?)\s*[\[(]([^\[\]()]*[A-Za-zµ°%][^\[\]()]*)[\])]\s*", name)
     return (name.strip(), None) if match is None else (match[1], match[2].strip())
-
-
-def unit_in_name(name: str, asked: str) -> str | None:
-    """The unit in a column's name.
-
-    Args:
-        name: Of the column, such as "torque [N m]".
-        asked: The name by which it was requested. If in full, what stands behind it may be an explanation.
-    """
-    unit = split_unit(name)[1]
-    return None if unit is not None and name == asked and not is_unit(unit) else unit

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fitting.errors import InputError
+from fitting.logs.column_names import unit_in_name
 from fitting.logs.lvm import MAGIC, lvm_table
 from fitting.logs.plain_numbers import plain_columns
-from fitting.logs.raw_table import DATE, HALF_DAY, RawColumn, RawTable, numbered, places_of, split_unit, unit_in_name
+from fitting.logs.raw_table import DATE, HALF_DAY, RawColumn, RawTable, numbered, places_of, split_unit
 from fitting.logs.units import USUAL
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
