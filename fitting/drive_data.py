@@ -88,7 +88,9 @@ def rig_of(
     fitted, tests = tuple(known for known, _ in parts), [end for _, end in parts if end is not None]
     if test:
         tests = [whole_test_log(log, drive_file, zeros=zeros) for log in test]
-        findings |= {log.name: examine(log, drive_file) for log in tests}
+        for log in tests:
+            findings[log.name] = examine(log, drive_file)
+            refuse_unfit(findings[log.name], log)
     # The end of a log keeps its clock.
     starts = {log.name: float(log.time[0]) for log in (*fitted, *test)}
     return Rig(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fitting.drive_data import read_rig
-from fitting.errors import InputError
+from fitting.errors import DataError, InputError
 
 
 def write(folder: Path, name: str, seed: int, *, warm: bool = False) -> Path:
@@ -63,3 +63,12 @@ def test_temperature_counts_only_where_all_logs_have_one(tmp_path: Path, drive: 
         told = {name: [f.what for f in some if f.where == "temperature"] for name, some in found.findings.items()}
         assert told.pop("bare") == []
         assert all(what == ["bare has none"] for what in told.values())
+
+
+def test_test_log_that_is_unfit_is_refused(tmp_path: Path, drive: Path):
+    fitted, test = write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 1)
+    name, *rows = test.read_text(encoding="utf-8").splitlines()
+    mirrored = [",".join([t, m, str(-float(load)), torque]) for t, m, load, torque in (row.split(",") for row in rows)]
+    test.write_text("\n".join([name, *mirrored]), encoding="utf-8")
+    with pytest.raises(DataError, match=r"b\.csv: .* sign = -1"):
+        read_rig([fitted], drive, test=[test])

@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ class InspectionResult:
 
     def drive_file(self) -> str:
         """The text of a drive file: each guess with its reason, and lines to fill in for unknown values."""
-        return drive_file_text(self.inspection, "`hdjax init`")
+        return drive_file_text(self.inspection)
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> Path:
         """Write the drive file.
@@ -151,4 +151,15 @@ def inspected(tables: Sequence[Table], *, joint: str | None = None) -> Inspectio
     found = inspect_tables(tables, joint=joint)
     with np.errstate(all="ignore"):
         moved = tuple(excitation(found, k) for k in range(len(tables)))
-    return InspectionResult(found, health(found), moved, promises(found, moved[0]))
+    return InspectionResult(found, health(found), moved, promises(found, _most(moved)))
+
+
+def _most(moved: Sequence[Excitation]) -> Excitation:
+    """The largest twist, and the widest band with what is seen in it: a log at rest must not decide for the others."""
+
+    def width(band: tuple[float, float] | None) -> float:
+        return -1.0 if band is None else band[1] - band[0]
+
+    # Noise of a torque at rest has a wide band, but nothing follows it.
+    widest = max(moved, key=lambda one: (width(one.coherent), width(one.band)))
+    return replace(widest, twist=max((one.twist for one in moved if one.twist is not None), default=None))

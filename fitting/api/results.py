@@ -13,6 +13,7 @@ from fitting.errors import InputError
 from fitting.outcome import Loop
 from fitting.progress import Progress, silent
 from fitting.report import Report
+from fitting.report.outputs import final_account
 from fitting.report.parameters import PARTS
 from fitting.report.plots import Plot
 from fitting.stored_model import StoredModel
@@ -72,13 +73,12 @@ class Result:
     @property
     def parameters(self) -> "pl.DataFrame":
         """The drive's parameters in the final model: value, standard error, 95 % interval, unit, flag."""
-        final = self.report["after"]["parameters"] or self.report["before"]["parameters"]
-        return _estimates(final)
+        return _estimates(final_account(self.report)["parameters"])
 
     @property
     def rmse(self) -> dict[str, float]:
         """Rms error of the final model on each part of the data, in the unit of the dynamic error."""
-        final = self.report["after"] if self.report["after"]["parameters"] else self.report["before"]
+        final = final_account(self.report)
         return {part: final["rmse"][part] for part in PARTS if final["rmse"].get(part) is not None}
 
     @property

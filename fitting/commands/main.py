@@ -72,7 +72,8 @@ def main(arguments: list[str] | None = None) -> None:
         # The reader of the pipe, such as `head`, has closed it; files are written before anything is printed.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
-        _fail(f"{error.filename}: {error.strerror}; check the path and its permissions", 2)
+        what = str(error) if error.filename is None else f"{error.filename}: {error.strerror}"
+        _fail(f"{what}; check the path and its permissions", 2)
 
 
 def _fail(error: object, code: int) -> None:

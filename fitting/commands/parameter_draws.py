@@ -11,6 +11,7 @@ import polars as pl
 from scipy.stats import qmc
 
 from fitting.errors import DataError, InputError
+from fitting.report.outputs import final_account
 from fitting.report.posterior import DRAWS_FILE
 from fitting.stored_model import read_model
 from hdjax import TwoInertiaModel
@@ -37,7 +38,7 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
     model = fitted_model(folder)
     try:
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        account = report["after"] if report["after"]["parameters"] else report["before"]
+        account = final_account(report)
         estimates = {p: e for p, e in account["parameters"].items() if p not in hold}
         spreads = {
             p: (float(e["value"]), float(e["std"] or np.inf), bool(e["identifiable"])) for p, e in estimates.items()

@@ -1,6 +1,7 @@
 """Implementation of `hdjax inspect` and `hdjax init`."""
 
 import shlex
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -56,12 +57,18 @@ def write_drive_file(logs: Iterable[Path], out: Path, joint: str | None) -> None
 
 
 def _tables(logs: Iterable[Path]) -> list[Table]:
-    return [read_columns(path) for log in logs for path in (_inside(log) if log.is_dir() else [log])]
+    return [table for log in logs for table in (_inside(log) if log.is_dir() else [read_columns(log)])]
 
 
-def _inside(folder: Path) -> list[Path]:
-    """The logs of a folder, in order of their names."""
-    found = [p for p in sorted(folder.iterdir()) if p.is_file() and format_suffix(p) in LOG_SUFFIXES]
+def _inside(folder: Path) -> list[Table]:
+    """The logs of a folder, in order of their names; files that can't be read as one are told."""
+    found = []
+    for path in sorted(folder.iterdir()):
+        if path.is_file() and format_suffix(path) in LOG_SUFFIXES and not path.name.startswith("."):
+            try:
+                found.append(read_columns(path))
+            except InputError as error:
+                print(f"hdjax: {error}", file=sys.stderr)
     if not found:
         raise InputError(f"{folder}: the folder has no log; give one with {', '.join(LOG_SUFFIXES)} files")
     return found

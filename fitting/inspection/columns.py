@@ -92,7 +92,8 @@ def read_columns(path: Path, source: Any = None) -> Table:
     names = tuple(dict.fromkeys(read(()).names))
     raw, left_out, rate = _all(read, names)
     kept = {name: column for name, column in raw.items() if len(column.values) >= _FEWEST_ROWS}
-    left_out |= {name: "a single number" for name in raw if name not in kept}
+    counts = {name: len(column.values) for name, column in raw.items() if name not in kept}
+    left_out |= {name: "a single number" if n == 1 else f"only {n} rows" for name, n in counts.items()}
     for name, column in list(kept.items()):
         reason = _no_channel(column)
         if reason:

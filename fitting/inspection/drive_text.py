@@ -34,9 +34,9 @@ def drive_tables(inspection: Inspection) -> dict[str, Any]:
     """The known tables of a drive file, without values that must be filled in."""
     joint = inspection.joint
     drive: dict[str, Any] = {"name": _name(inspection)}
-    if joint.ratio is not None and joint.ratio.sure:
+    if joint.ratio is not None and joint.ratio.sure and not joint.ratio.inverted:
         drive["reduction_ratio"] = _number(joint.ratio.value)
-    columns = {s: _place(inspection, joint.signals[s]) for s in _written(inspection)}
+    columns = {s: column_place(inspection, joint.signals[s]) for s in _written(inspection)}
     if inspection.time.column is not None:
         columns = {"time": _time_place(inspection)} | columns
     return {"drive": drive, "columns": columns}
@@ -46,8 +46,9 @@ def unknowns(inspection: Inspection) -> dict[str, str]:
     """Values that must be filled in before a fit, by their place in the drive file, with the reason."""
     joint = inspection.joint
     missing: dict[str, str] = {}
-    both = set(_ANGLES) <= set(joint.signals)
-    if (both or joint.kind == "motor side") and "reduction_ratio" not in drive_tables(inspection)["drive"]:
+    if (_both_angles(inspection) or joint.kind == "motor side") and "reduction_ratio" not in drive_tables(inspection)[
+        "drive"
+    ]:
         missing["[drive] reduction_ratio"] = _why_no_ratio(inspection)
     if joint.kind in ("drive", "motor side"):
         missing |= {f"[drive] {key}": what for key, what in _INERTIAS.items()}
@@ -65,17 +66,12 @@ def unknowns(inspection: Inspection) -> dict[str, str]:
     return missing
 
 
-def drive_file_text(inspection: Inspection, made_by: str) -> str:
-    """The drive file.
-
-    Args:
-        inspection: The guesses.
-        made_by: The command or verb, for the first line.
-    """
+def drive_file_text(inspection: Inspection) -> str:
+    """The drive file."""
     tables = drive_tables(inspection)
     names = ", ".join(table.path.name for table in inspection.tables)
     head = [
-        f"# Written by {made_by} from {names}.",
+        f"# Written by `hdjax init` from {names}.",
         "# Each guess is followed by its reason: check it. Lines with FILL IN are not known from the logs:",
         "# complete them and remove the # before them.",
     ]
@@ -85,7 +81,7 @@ def drive_file_text(inspection: Inspection, made_by: str) -> str:
     written = _written(inspection)
     for signal in _in_order(inspection.joint.signals):
         guess = inspection.joint.signals[signal]
-        place, open_place = _toml(_place(inspection, guess)), _open_place(inspection, guess)
+        place, open_place = _toml(column_place(inspection, guess)), _open_place(inspection, guess)
         if signal in written:
             lines.append(_with_reason(f"{signal} = {place}", guess))
         elif _spare(inspection, signal):
@@ -125,13 +121,12 @@ def _unseen_angles(inspection: Inspection) -> list[str]:
     return [signal for signal in _ANGLES if signal not in joint.signals and signal not in maybe]
 
 
-def _known_angles(inspection: Inspection) -> bool:
-    """Whether the ratio of the angles is that of the drive: units that cancel may be unknown."""
-    signals = inspection.joint.signals
-    return all(s in signals for s in _ANGLES)
+def _both_angles(inspection: Inspection) -> bool:
+    return set(_ANGLES) <= set(inspection.joint.signals)
 
 
-def _place(inspection: Inspection, guess: SignalGuess) -> dict[str, Any]:
+def column_place(inspection: Inspection, guess: SignalGuess) -> dict[str, Any]:
+    """Column, unit and sign of a signal, as in a drive file."""
     place: dict[str, Any] = {"column": inspection.unique(guess.column)}
     if guess.unit is not None:
         place["unit"] = guess.unit
@@ -162,7 +157,6 @@ def _with_reason(line: str, guess: SignalGuess) -> str:
 
 def _ratio_lines(inspection: Inspection) -> list[str]:
     ratio = inspection.joint.ratio
-    both = _known_angles(inspection)
     known = "reduction_ratio" in drive_tables(inspection)["drive"]
     if ratio is not None and known:
         said = f"reduction_ratio = {_toml(_number(ratio.value))}"
@@ -171,9 +165,9 @@ def _ratio_lines(inspection: Inspection) -> list[str]:
         else:
             why = f"the angles admit {ratio.low:.4g} to {ratio.high:.4g}"
         return [f"{said}  # guess: {why}"]
-    if inspection.joint.kind == "reduced" or (inspection.joint.kind == "quasi-static" and not both):
+    if inspection.joint.kind == "reduced" or (inspection.joint.kind == "quasi-static" and not _both_angles(inspection)):
         return []
-    likely = f" {_toml(_number(ratio.value))}" if ratio is not None else ""
+    likely = f" {_toml(_number(ratio.value))}" if ratio is not None and not ratio.inverted else ""
     return [f"# reduction_ratio ={likely or ' ...'}  # {_WHERE_TO_FILL}: {_why_no_ratio(inspection)}"]
 
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from fitting.errors import DataError, InputError
-from fitting.inspection.drive_text import drive_tables
+from fitting.inspection.drive_text import column_place, drive_tables
 from fitting.inspection.inspection import Inspection
+from fitting.inspection.settling import RatioGuess
 from fitting.inspection.time_column import sampling_findings
 from fitting.logs.checks import examine
 from fitting.logs.drive_file import drive_of
@@ -28,7 +29,7 @@ def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
     tables = drive_tables(inspection)
     current = inspection.joint.signals.get("motor_current")
     if current is not None and "motor_torque" not in inspection.joint.signals:
-        place = {"column": inspection.unique(current.column), "unit": current.unit or "A"}
+        place = {"unit": "A"} | column_place(inspection, current)
         tables["columns"]["motor_current"] = place | {"torque_constant": _ANY_CONSTANT}
     readable = inspection.joint.kind is not None and _complete(inspection, tables)
     return tuple(
@@ -45,6 +46,8 @@ def _complete(inspection: Inspection, tables: Mapping[str, Any]) -> bool:
 
 def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[Finding, ...]:
     path, source, ratio = inspection.tables[k].path, inspection.tables[k].source, inspection.joint.ratio
+    if ratio is not None and ratio.inverted:
+        return (_inverted(ratio), *_of_columns(inspection, k))
     known = dict(tables["drive"]) | ({} if ratio is None else {"reduction_ratio": float(ratio.value)})
     filled = {"reduction_ratio": 1.0, "motor_inertia": _ANY_INERTIA, "load_inertia": _ANY_INERTIA} | known
     signals = {} if inspection.rates[k] is not None else {"sample_rate": _ANY_RATE}
@@ -58,6 +61,15 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
         return (*log.findings, *_constants(inspection, k))
     # Without inertias, findings on them are dropped.
     return examine(log, drive_of({**tables, "drive": known, "signals": signals}, _DRIVE_FILE))
+
+
+def _inverted(ratio: RatioGuess) -> Finding:
+    return Finding(
+        "refusal",
+        f"the load angle moves {1.0 / ratio.value:.4g} times as far as the motor angle",
+        "load_angle against motor_angle",
+        "the columns seem swapped, or one unit is wrong",
+    )
 
 
 def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:

@@ -212,7 +212,10 @@ def ratio_odds(ratio: float) -> float:
 def hypotheses(evidence: Evidence) -> list[Hypothesis]:
     """The likely assignments, the best first."""
     motors, loads, twists = ([None, *evidence.candidates(signal)] for signal in ANGLES)
-    frames = [(m, f, x) for m, f, x in product(motors, loads, twists) if _distinct(m, f, x)]
+    pairs = [(m, f) for m, f in product(motors, loads) if _distinct(m, f)]
+    # Twists of the likeliest pairs alone: with all, the time would grow with the cube of the number of columns.
+    pairs = sorted(pairs, key=lambda pair: -evidence.geometry(*pair, None))[:_MOST_FRAMES]
+    frames = [(m, f, x) for (m, f), x in product(pairs, twists) if _distinct(m, f, x)]
     weighed = sorted(((evidence.geometry(*frame), frame) for frame in frames), key=lambda pair: -pair[0])[:_MOST_FRAMES]
     found = []
     for odds, frame in weighed:
@@ -301,4 +304,4 @@ def _margin(evidence: Evidence, best: Hypothesis, signal: str, column: int, fram
     heirs = [evidence.other(signal, k, *frame) for k in free if evidence.names[signal][k].odds > _WORST_NAME]
     idle = [s for s in OTHERS if s not in best.columns and evidence.names[s][column].odds > _WORST_NAME]
     elsewhere = [evidence.other(s, column, *frame) for s in idle]
-    return own - max(0.0, *heirs, *elsewhere, 0.0)
+    return own - max([0.0, *heirs, *elsewhere])

@@ -37,7 +37,6 @@ class SignalGuess:
         signal: Of a drive file.
         column: Name of the column.
         unit: Stated or guessed, or None if unknown.
-        unit_stated: Whether the file states it.
         size: Of the unit in SI.
         sign: +1 or -1.
         confidence: 0 to 1.
@@ -49,7 +48,6 @@ class SignalGuess:
     signal: str
     column: str
     unit: str | None
-    unit_stated: bool
     size: float
     sign: int
     confidence: float
@@ -348,7 +346,6 @@ def _signal(
         signal=name,
         column=column.name,
         unit=column.unit,
-        unit_stated=column.unit is not None,
         size=1.0 if column.unit is None else si_size(column.unit, SI.get(signal, "A")) or 1.0,
         sign=sign[0] if sign else 1,
         confidence=confidence,
@@ -361,7 +358,7 @@ def _signal(
     rivals = " or ".join(unit.rivals)
     if unit.confidence < _TOLD_UNIT:
         doubts = (f"its unit may be {unit.unit} or {rivals}", *doubts)
-        return replace(guess, unit=None, unit_stated=False, size=unit.size, doubts=doubts)
+        return replace(guess, unit=None, size=unit.size, doubts=doubts)
     if unit.confidence < _SURE_UNIT:
         doubts = (f"{unit.unit} is assumed, {rivals} is possible", *doubts)
-    return replace(guess, unit=unit.unit, unit_stated=False, size=unit.size, unit_reason=unit.reason, doubts=doubts)
+    return replace(guess, unit=unit.unit, size=unit.size, unit_reason=unit.reason, doubts=doubts)

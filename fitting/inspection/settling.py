@@ -62,6 +62,11 @@ class RatioGuess:
     high: float
     sure: bool
 
+    @property
+    def inverted(self) -> bool:
+        """Whether the load angle moves farther than the motor angle, as in no gear."""
+        return self.value < 1.0
+
 
 def units_of(
     columns: Mapping[str, int], evidence: Evidence, logs: Sequence[Uniform]
@@ -190,7 +195,7 @@ def ratio_of(
     value = slope * known["motor_angle"].size / known["load_angle"].size
     margin = value * max(_HIDDEN * share, _ROUNDED)
     low, high = value - margin, value + margin
-    if margin < 0.5:
+    if margin < 0.5 and value > 0.5:
         # Strain-wave gears have integer ratios.
         return RatioGuess(float(round(value)), low, high, sure=low <= round(value) <= high and alike >= SURE)
     usual = [n for n in _CATALOGUE if low <= n <= high]

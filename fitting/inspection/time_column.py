@@ -41,7 +41,6 @@ class TimeGuess:
         unit: Of its stamps.
         confidence: Of the column, 0 to 1.
         reasons: For both.
-        unit_stated: Whether the file states the unit.
         fraction: Column with the parts of a second, and their unit; None where the stamps are in one column.
         clocks: For a table with several time columns: the clock of each column with a later one, by name.
     """
@@ -50,7 +49,6 @@ class TimeGuess:
     unit: str
     confidence: float
     reasons: tuple[str, ...]
-    unit_stated: bool = True
     clocks: dict[str, str] = field(default_factory=dict)
     fraction: tuple[str, str] | None = None
 
@@ -94,9 +92,8 @@ def guess_time(table: Table) -> TimeGuess:
     if "time" in column.sense.quantities:
         reasons.insert(0, f"the name '{column.name}'")
     unit, why = _unit(column)
-    stated = _stated(column) is not None
     confidence = float(np.exp(min(score, 30.0)) / weights.sum())
-    return TimeGuess(column.name, unit, confidence, (*reasons, why), stated, _clocks(table, column.name))
+    return TimeGuess(column.name, unit, confidence, (*reasons, why), _clocks(table, column.name))
 
 
 def _pair(table: Table, column: Column | None) -> tuple[str, str, str] | None:

@@ -34,7 +34,6 @@ class Scale(NamedTuple):
     """Averages over windows of one length, without the mean of each log, (windows, channels).
 
     Attributes:
-        seconds: length of a window.
         value: of the channels.
         rate: of their derivative [1/s].
         acceleration: of their second derivative [1/s^2].
@@ -42,7 +41,6 @@ class Scale(NamedTuple):
         cube: of the third power of the channels without their mean.
     """
 
-    seconds: float
     value: np.ndarray
     rate: np.ndarray
     acceleration: np.ndarray
@@ -76,7 +74,6 @@ def uniform(time: np.ndarray, columns: Sequence[tuple[np.ndarray, np.ndarray | N
 def scales(logs: Sequence[Uniform]) -> tuple[Scale, ...]:
     """Averages over windows of several lengths, each half of the one before, concatenated over logs."""
     shortest = min(len(log.values) for log in logs)
-    step = float(np.median([log.step for log in logs]))
     directed = [_directions(log.values) for log in logs]
     found = []
     length = shortest // (_FEWEST + 4) * 2 + 1
@@ -84,7 +81,7 @@ def scales(logs: Sequence[Uniform]) -> tuple[Scale, ...]:
         parts = [_averages(log, direction, length) for log, direction in zip(logs, directed, strict=True)]
         kept = [part for part in parts if len(part[0])]
         if sum(len(part[0]) for part in kept) >= _FEWEST:
-            found.append(Scale(length * step, *(np.concatenate(both) for both in zip(*kept, strict=True))))
+            found.append(Scale(*(np.concatenate(both) for both in zip(*kept, strict=True))))
         length = length // 2 // 2 * 2 + 1
     return tuple(found)
 

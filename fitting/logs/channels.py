@@ -153,7 +153,7 @@ def _unwrapped(
     if signal in ("motor_angle", "load_angle"):
         found, span, rows = unwrapped_angle(values, _revolution(drive_file, signal, place, unit))
         severity, what = "note", "wraps"
-    elif signal in ("motor_torque", "load_torque", "forcing"):
+    elif signal in ("motor_torque", "load_torque", "joint_torque", "forcing"):
         found, span, rows = unwrapped_overflow(values)
         severity, what = "warning", "overflows its integers"
     else:

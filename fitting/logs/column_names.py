@@ -7,6 +7,7 @@ from functools import cache
 from typing import Literal, cast
 
 from fitting.logs.raw_table import split_unit
+from fitting.logs.units import is_unit
 
 Quantity = Literal[
     "time", "counter", "angle", "velocity", "torque", "current", "temperature", "twist", "input", "other"
@@ -339,3 +340,14 @@ def is_likely(name: str, signal: str) -> bool:
 def likely_columns(signal: str, names: Iterable[str]) -> list[str]:
     """The columns of a file that may be a signal, by their names."""
     return [name for name in names if is_likely(name, signal)]
+
+
+def unit_in_name(name: str, asked: str) -> str | None:
+    """The unit in a column's name.
+
+    Args:
+        name: Of the column, such as "torque [N m]".
+        asked: The name by which it was requested. If in full, what stands behind it may be an explanation.
+    """
+    unit = split_unit(name)[1]
+    return None if unit is not None and name == asked and not is_unit(unit) else unit

@@ -94,12 +94,19 @@ def input_rows(
 def interpolated(
     path: Path, drive_file: DriveFile, time: np.ndarray, signals: dict[str, np.ndarray]
 ) -> tuple[Finding, ...]:
-    """Fill missing values of the inputs; the fit uses the main one only where it was sampled."""
+    """Fill missing values of the inputs; the fit uses the main one only where it was sampled.
+
+    An optional input without numbers is left out, unless the drive file names it.
+    """
     findings = []
     for name in ("motor_torque", "forcing", "joint_torque", *OPTIONAL_SIGNALS):
         if name not in signals:
             continue
         known = np.isfinite(signals[name])
+        if known.sum() < 2 and name in OPTIONAL_SIGNALS and name not in drive_file.columns:
+            del signals[name]
+            findings.append(Finding("note", f"{name} holds no numbers", name, "it was left out"))
+            continue
         if known.sum() < 2:
             raise InputError(
                 f"{path}: {_column(drive_file, name)} holds no numbers; name the right column or leave it out"

@@ -9,8 +9,9 @@ import numpy as np
 import polars as pl
 
 from fitting.errors import InputError
+from fitting.logs.column_names import unit_in_name
 from fitting.logs.parquet import column_from_series
-from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of, split_unit
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of
 
 
 def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
@@ -29,11 +30,11 @@ def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
     labels = list(source.columns if hasattr(source, "columns") else found)
     names = tuple(map(str, labels))
     places = places_of(dict.fromkeys(wanted), names)
-    return RawTable(names, {name: _column(path, names[at], found[labels[at]]) for name, at in places.items()})
+    return RawTable(names, {name: _column(path, names[at], found[labels[at]], name) for name, at in places.items()})
 
 
-def _column(path: Path, name: str, values: Any) -> RawColumn:
-    unit = getattr(values, "attrs", {}).get("units") or split_unit(name)[1]
+def _column(path: Path, name: str, values: Any, asked: str) -> RawColumn:
+    unit = getattr(values, "attrs", {}).get("units") or unit_in_name(name, asked)
     series = values if isinstance(values, pl.Series) else _series(path, name, values)
     column = column_from_series(path, series)
     return column if column.unit is not None else replace(column, unit=unit)

@@ -299,6 +299,19 @@ def _refuse_unequal(path: Path, drive_file: DriveFile, raw: dict[str, RawColumn]
             )
 
 
+def _without_unequal(
+    drive_file: DriveFile, raw: dict[str, RawColumn], required: Sequence[str]
+) -> tuple[dict[str, RawColumn], tuple[Finding, ...]]:
+    """The columns without optional ones of another length that the drive file doesn't name; and notes on these."""
+    rows, kept = len(raw[required[0]].values), {*required, *drive_file.columns, "time"}
+    counts = {s: len(column.values) for s, column in raw.items() if s not in kept and len(column.values) != rows}
+    findings = [
+        Finding("note", f"{signal} has {count} rows, where {required[0]} has {rows}", signal, "it was left out")
+        for signal, count in counts.items()
+    ]
+    return {s: column for s, column in raw.items() if s not in counts}, tuple(findings)
+
+
 def _inhabited(
     path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, RawColumn], required: Sequence[str]
 ) -> tuple[dict[str, RawColumn], int, int, tuple[Finding, ...]]:
@@ -308,6 +321,8 @@ def _inhabited(
     raw = {s: raw[s] for s in (*used, *velocities, "time") if s in raw}
     raw, mended = with_own_clocks(path, drive_file, table, raw)
     raw = on_one_grid(raw, required, path)
+    raw, spare = _without_unequal(drive_file, raw, required)
+    used = [s for s in used if s in raw]
     _refuse_unequal(path, drive_file, raw, used)
     filled = np.zeros(len(raw[used[0]].values), dtype=bool)
     for signal in used:
@@ -322,7 +337,7 @@ def _inhabited(
             f"{path}: the log has {stop - start} rows, which is fewer than the {SHORTEST} that "
             "a fit needs; record a longer one"
         )
-    return raw, start, stop, (*mended, *_blank_rows(start, len(filled) - stop))
+    return raw, start, stop, (*mended, *spare, *_blank_rows(start, len(filled) - stop))
 
 
 def _blank_rows(leading: int, trailing: int) -> tuple[Finding, ...]:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of, split_unit
+from fitting.logs.column_names import unit_in_name
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of
 from fitting.logs.text_cells import column_from_text
 
 
@@ -29,7 +30,7 @@ def read_parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) ->
         names = tuple(pl.read_parquet_schema(source))
         found = {name: names[place] for name, place in places_of(wanted, names).items()}
         frame = pl.read_parquet(source, columns=list(dict.fromkeys(found.values())), use_statistics=False)
-    return RawTable(names, {name: column_of(path, full, frame[full]) for name, full in found.items()})
+    return RawTable(names, {name: _column(path, full, frame[full], name) for name, full in found.items()})
 
 
 @contextmanager
@@ -45,10 +46,10 @@ def _quiet() -> Iterator[None]:
         os.close(nowhere)
 
 
-def column_of(path: Path, name: str, series: pl.Series) -> RawColumn:
+def _column(path: Path, name: str, series: pl.Series, asked: str) -> RawColumn:
     """A series as numbers, in its unit, or that stated in its name."""
     column = column_from_series(path, series)
-    return column if column.unit is not None else replace(column, unit=split_unit(name)[1])
+    return column if column.unit is not None else replace(column, unit=unit_in_name(name, asked))
 
 
 def column_from_series(path: Path, series: pl.Series) -> RawColumn:

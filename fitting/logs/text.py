@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fitting.errors import InputError
+from fitting.logs.column_names import unit_in_name
 from fitting.logs.lvm import MAGIC, lvm_table
 from fitting.logs.plain_numbers import plain_columns
 from fitting.logs.raw_table import DATE, HALF_DAY, RawColumn, RawTable, numbered, places_of, split_unit
-from fitting.logs.units import USUAL, is_unit
+from fitting.logs.units import USUAL
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
@@ -21,7 +22,8 @@ _PREAMBLE = 2000
 _LINES_ABOVE = 24
 _MOST_LEFT_OUT = 3
 _NUMBER = re.compile(
-    r"[-+\u2212]?(?:[0-9][0-9.,'’]*|\.[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE
+    r"[-+\u2212]?(?:[0-9][0-9.,'’]*|\.[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)|true|false",
+    re.IGNORECASE,
 )
 _STAMP = re.compile(
     rf"(?:{DATE}[T _]|[0-9]+ days?,? )?[0-9]{{1,4}}:[0-9]{{2}}(?::[0-9]{{2}})?(?:[.,][0-9]*)?{HALF_DAY}"
@@ -78,10 +80,7 @@ class Head:
         """
         columns = {}
         for name, place in self.places(wanted).items():
-            stated = split_unit(self.names[place])[1]
-            # What stands behind a name that is stated in full may be an explanation.
-            if stated is not None and self.names[place] == name and not is_unit(stated):
-                stated = None
+            stated = unit_in_name(self.names[place], name)
             below = self.units[place] if place < len(self.units) else None
             columns[name] = replace(found[place], unit=found[place].unit or stated or below or None)
         plain = [split_unit(name)[0] for name in self.names]
@@ -154,7 +153,9 @@ def _decode(path: Path, raw: bytes) -> str:
 
 def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
-        return line.split()
+        # Each name or cell may be quoted; a lone mark is a part of its cell.
+        quoted = line.count('"') > 0 and line.count('"') % 2 == 0
+        return next(csv.reader([" ".join(line.split())], delimiter=" "), []) if quoted else line.split()
     if '"' in line:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
     return [cell.strip() for cell in line.split(delimiter)]
@@ -247,7 +248,16 @@ def _header(
     behind = range((rows[-1][0] if has_units else index) + 1, dialect.first)
     rows_begin = (i for i in behind if not _LETTER.search(lines[i]) or _row(lines[i], dialect.delimiter)[1] > 0)
     first = next(rows_begin, dialect.first)
+    if len(names) == dialect.width - 1 and _last_is_a_signal(lines, dialect):
+        # R and pandas give the column of row names no name.
+        names, units = ["", *names], ["", *units] if len(units) == len(names) else units
     return _each_once(names), units, first
+
+
+def _last_is_a_signal(lines: list[str], dialect: _Dialect) -> bool:
+    """Whether the last cells of rows hold numbers; they are empty where rows end in a delimiter."""
+    rows = (_split(line, dialect.delimiter) for line in lines[dialect.first : dialect.first + _LOOKED_AT])
+    return any(len(row) >= dialect.width and _is_number(row[dialect.width - 1]) for row in rows)
 
 
 def _numbered(path: Path, lines: list[str], dialect: _Dialect, wanted: tuple[str, ...]) -> list[str]:
@@ -296,10 +306,13 @@ def _are_units(cells: list[str]) -> bool:
 
 
 def _header_alone(lines: list[str]) -> tuple[str, ...]:
-    """Names in the last line of a text without rows."""
-    line = next(line for line in reversed(lines) if line.strip()).lstrip("# ")
-    delimiter = max(_DELIMITERS[:-1], key=line.count)
-    return tuple(cell[:60] for cell in _split(line, delimiter) if cell)
+    """Names in the last line without numbers, of a text without rows."""
+    for line in reversed(lines):
+        delimiter = max(_DELIMITERS[:-1], key=line.count)
+        names = tuple(cell[:60] for cell in _split(line.lstrip("# "), delimiter) if cell)
+        if names and not any(map(_is_number, names)):
+            return names
+    return ()
 
 
 def _columns(lines: list[str], delimiter: str, width: int, places: list[int]) -> dict[int, RawColumn]:

@@ -111,7 +111,7 @@ def report_dict(
 def _after(outcome: Outcome, units: Mapping[str, str], x_max: float) -> dict[str, Any]:
     """The final model of a loop; a fit has none."""
     if not isinstance(outcome, Loop):
-        return no_account() | {"effects": []}
+        return no_account()
     after = account_dict(outcome.after, units, x_max)
     if outcome.parameters_from == "torque":
         widen_by_ties(after, outcome, x_max)

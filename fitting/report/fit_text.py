@@ -144,7 +144,12 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _health(health: Sequence[Mapping[str, Any]]) -> list[str]:
-    return _prose([f"{h['severity']}: {h['log']}, {h['where']}: {h['what']}; {h['consequence']}" for h in health])
+    return _prose([health_line(h) for h in health])
+
+
+def health_line(seen: Mapping[str, Any]) -> str:
+    """A finding of the health check in one line."""
+    return f"{seen['severity']}: {seen['log']}, {seen['where']}: {seen['what']}; {seen['consequence']}"
 
 
 def _table(rows: Sequence[Sequence[str]], *, left: Sequence[int]) -> list[str]:

@@ -5,7 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.report.outcome import Outcome
-from fitting.report.outputs import in_words
+from fitting.report.outputs import final_account, in_words
 from fitting.report.separating import plain_family
 from fitting.report.steps import beyond_prediction
 from fitting.uncertainty.identifiability import Identifiability
@@ -68,7 +68,7 @@ def in_words_of_log(sentence: str, units: Mapping[str, str]) -> str:
 
 def limits(report: Mapping[str, Any]) -> list[str]:
     """Limits of the data, one sentence each."""
-    final = report["after"] if report["after"]["parameters"] else report["before"]
+    final = final_account(report)
     found = report["identifiability"]
     # Single coefficients of a learned torque have no meaning.
     learned = tuple(f"{e['name']}." for e in report["after"]["effects"] if e["family"] == "unknown")

@@ -41,3 +41,8 @@ def outputs(report: Mapping[str, Any]) -> list[str]:
 def others(report: Mapping[str, Any]) -> list[str]:
     """The outputs beside the principal one."""
     return [name for name in report["before"]["rmse_of_outputs"] if name != report["output"]]
+
+
+def final_account(report: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The account of the final model: that after the loop, if there is one."""
+    return report["after"] if report["after"]["parameters"] else report["before"]

@@ -9,7 +9,7 @@ from plotly.offline import get_plotlyjs
 
 from fitting import formatting
 from fitting.report.intervals import is_withheld
-from fitting.report.outputs import in_words, others, principal
+from fitting.report.outputs import final_account, in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.plots import Plot
 from fitting.report.posterior import QUANTILES
@@ -44,7 +44,6 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         "p_value": formatting.p_value,
         "symbol": _symbol,
     }
-    final = report["after"] if report["after"]["parameters"] else report["before"]
     output, unit, noise = principal(report)
     template = "fit.html.jinja" if report["decision"] == "fit_only" else "loop.html.jinja"
     return (
@@ -61,12 +60,12 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
             in_words=in_words,
             gain=gain,
             chance=lambda effect: chance(effect, report),
-            rows=parameter_rows(report, final),
+            rows=parameter_rows(report, final_account(report)),
             changes=changes(report),
             quantiles=QUANTILES,
             next_lines=next_lines(report),
             sections={s: [p for p in pictures if p.section == s] for s in _SECTIONS},
-            plots=[p for p in pictures if p.section in _SECTIONS],
+            plots=pictures,
             plotlyjs=Markup(get_plotlyjs()),
         )
     )

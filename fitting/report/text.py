@@ -4,13 +4,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting.formatting import open_interval, plain
-from fitting.report.fit_text import fit_lines, rounded
+from fitting.report.fit_text import fit_lines, health_line, rounded
 from fitting.report.intervals import is_withheld
-from fitting.report.outputs import in_words, others, principal
+from fitting.report.outputs import final_account, in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.proposal import next_lines
 from fitting.report.separating import plain_family
 from fitting.report.summary import chance, gain
+
+_HEAD = 14
+"""Width of the heads of rows; "motor velocity" fits."""
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -24,22 +27,21 @@ def report_text(report: Mapping[str, Any]) -> str:
 
 def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     output, unit, noise = principal(report)
-    final = report["after"] if report["after"]["parameters"] else report["before"]
     lines = ["[Decision]", f"    {report['summary']}", f"[Rms error of the {output} in free runs]"]
     shown = [("model", report["before"])]
     if report["after"]["effects"]:
         shown = [("before", report["before"]), ("after", report["after"])]
-    lines.append("    " + " " * 12 + "".join(f"{n:>14}" for n, _ in shown))
+    lines.append("    " + " " * _HEAD + "".join(f"{n:>14}" for n, _ in shown))
     for part in parts_of(report):
         values = "".join(f"{plain(a['rmse'][part]):>14}" for _, a in shown)
-        lines.append(f"    {part:12}{values} {unit}")
+        lines.append(f"    {part:{_HEAD}}{values} {unit}")
     on = report["judged_on"]
     for other in others(report):
         values = "".join(f"{plain(a['rmse_of_outputs'][other][on]):>14}" for _, a in shown)
-        lines.append(f"    {in_words(other):12}{values} {report['units'][other]}, {on}")
-    lines.append(f"    {'noise':12}{plain(noise):>14} {unit}")
+        lines.append(f"    {in_words(other):{_HEAD}}{values} {report['units'][other]}, {on}")
+    lines.append(f"    {'noise':{_HEAD}}{plain(noise):>14} {unit}")
     lines.append("[Parameters]")
-    lines += _parameter_lines(final["parameters"])
+    lines += _parameter_lines(final_account(report)["parameters"])
     for effect in report["after"]["effects"]:
         family = plain_family(effect["family"])
         lines.append(f"[Effect: {effect['name']}] {family}: {gain(effect)}; {chance(effect, report)}")
@@ -53,6 +55,8 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"[Ruled out] {other['name']}: the selection data distinguish it from {other['instead_of']}.")
     for note in report["cannot_tell"]:
         lines.append(f"[Note] {note}")
+    for seen in (h for h in report["health"] if h["severity"] != "note"):
+        lines.append(f"[Log health] {health_line(seen)}")
     lines += [f"[Next experiment] {sentence}" for sentence in next_lines(report)]
     return lines
 

@@ -271,3 +271,17 @@ def test_shell_completion_is_installed(tmp_path, monkeypatch):
     assert run("install-completion", "--shell", "bash", "--output", script) == 0
     assert {"close-loop", "--drive"} <= set(script.read_text(encoding="utf-8").replace("'", " ").split())
     assert str(script) in (tmp_path / ".bashrc").read_text(encoding="utf-8")
+
+
+def test_system_error_without_a_file_is_told_in_its_own_words(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fails(*_: object, **__: object):
+        raise OSError("no space is left")
+
+    monkeypatch.setattr(command_line, "app", fails)
+    assert run("inspect") == 2
+    assert_one_line(capsys, "no space is left")
+    monkeypatch.setattr(command_line, "app", lambda *_, **__: Path("/absent/a.csv").read_bytes())
+    assert run("inspect") == 2
+    assert_one_line(capsys, "/absent/a.csv: No such file")

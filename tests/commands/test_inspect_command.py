@@ -56,6 +56,20 @@ def test_logs_with_the_same_columns_are_inspected_together(tmp_path: Path, capsy
     assert not (tmp_path / "drive.toml").exists()
 
 
+def test_files_of_a_folder_that_are_no_logs_are_told_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("a long day\n", encoding="utf-8")
+    (folder / "._run.csv").write_bytes(b"\x00\x05\x16\x07")
+    assert run("inspect", folder) == 2
+    assert "no log" in capsys.readouterr().err
+    write_slow_log(folder / "run.csv")
+    assert run("inspect", folder) == 0
+    told = capsys.readouterr()
+    assert "run.csv: 2000 rows" in told.out
+    assert told.err.startswith(f"hdjax: {folder / 'notes.txt'}: ") and told.err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -143,3 +143,26 @@ def test_stamps_in_two_columns_are_written_and_read(motion: Motion, tmp_path: Pa
     (tmp_path / "drive.toml").write_text(fill_in(text), encoding="utf-8")
     (log,) = fitting.load(table, drive=tmp_path / "drive.toml").logs
     np.testing.assert_allclose(np.diff(log.time), 1e-3, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("motor", "load", "times"), [("load", "motor", 100), ("motor", "load", 57.3 / 25)])
+def test_load_angle_that_moves_farther_than_the_motor_angle_is_told(
+    motor: str, load: str, times: float, motion: Motion
+):
+    # Swapped columns, and a load angle in degrees behind a ratio of 25.
+    angles = {"motor": motion.motor_angle, "load": motion.load_angle}
+    if motor == "motor":
+        angles = {"motor": motion.motor_angle / 4, "load": np.rad2deg(motion.load_angle)}
+    columns = {"time": motion.time, "motor_angle [rad]": angles[motor], "load_angle [rad]": angles[load]}
+    found = fitting.inspect(columns | {"motor_torque [N m]": motion.motor_torque})
+    (refusal,) = found.findings[0]
+    assert refusal.severity == "refusal" and "swapped" in refusal.consequence
+    assert float(refusal.what.split()[4]) == pytest.approx(times, rel=0.01)
+    assert "# reduction_ratio = ...  # FILL IN" in found.drive_file()
+
+
+def test_guessed_sign_of_a_current_is_that_of_the_health_check(motion: Motion):
+    columns = {"time": motion.time, "motor_angle [rad]": motion.motor_angle, "motor_current [A]": -motion.motor_torque}
+    found = fitting.inspect(columns)
+    assert "sign = -1, torque_constant" in found.drive_file()
+    assert not [finding for finding in found.findings[0] if finding.severity == "refusal"]

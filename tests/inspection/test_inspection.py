@@ -4,6 +4,8 @@ import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import matplotlib
 import mutations
@@ -16,6 +18,7 @@ from simulated_joint import Motion, simulated
 import fitting
 from fitting import DataError, InputError
 from fitting.inspection.columns import read_columns
+from fitting.inspection.hypotheses import OTHERS, hypotheses
 from fitting.inspection.inspection import inspect_tables
 from fitting.inspection.time_column import sampling_findings
 
@@ -154,6 +157,8 @@ def test_several_logs_are_inspected_together(drive_log: dict[str, np.ndarray], m
     still = drive_log | {name: np.zeros(3000) for name in ("motor_angle", "load_angle", "motor_torque")}
     found = fitting.inspect([still, drive_log])
     assert found.inspection.joint.kind == "drive" and len(found.findings) == len(found.excitations) == 2
+    # What a fit can determine is that of the log that moves.
+    assert found.told == fitting.inspect([drive_log, still]).told == fitting.inspect(drive_log).told
     with pytest.raises(InputError, match="log 2: its columns are not those of log 1"):
         fitting.inspect([drive_log, SHAPES["German PLC"].columns(motion)])
 
@@ -182,6 +187,32 @@ def test_numbered_encoders_of_one_drive_are_not_detected_as_joints(motion: Motio
     found = fitting.inspect(columns).inspection
     assert found.joint.label is None
     assert {g.column: s for s, g in found.joint.signals.items()}["encoder1"] == "motor_angle"
+
+
+def test_short_columns_are_reported_with_their_rows(drive_log: dict[str, np.ndarray]):
+    found = fitting.inspect(drive_log | {"gain": np.ones(1), "limits": np.arange(5.0)})
+    assert found.inspection.tables[0].left_out == {"gain": "a single number", "limits": "only 5 rows"}
+
+
+class CountedEvidence:
+    """Evidence of columns that nothing tells apart; it counts the assignments of angles that are weighed."""
+
+    def __init__(self, count: int):
+        self.columns, self.weighed = range(count), 0
+        self.names = {signal: [SimpleNamespace(odds=-10.0)] * count for signal in OTHERS}
+
+    def candidates(self, signal: str) -> list[int]:
+        return [*self.columns]
+
+    def geometry(self, motor: int | None, load: int | None, twist: int | None) -> float:
+        self.weighed += 1
+        return -1.0 if motor is None else 0.0
+
+
+def test_twists_of_many_columns_are_sought_beside_likely_angles_alone():
+    evidence: Any = CountedEvidence(100)
+    hypotheses(evidence)
+    assert evidence.weighed < 300_000
 
 
 def test_text_and_blank_columns_are_reported_as_left_out(tmp_path: Path, drive_log: dict[str, np.ndarray]):

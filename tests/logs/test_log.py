@@ -2,12 +2,14 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 from log_files import DRIVE, FORMATS, ROWS, N, Table, drive_table, one_sentence, read_drive, save, save_text
 
+import fitting
 from fitting.errors import InputError
 from fitting.logs.log import read_log
 
@@ -214,3 +216,36 @@ def test_unit_row_applies_unless_the_drive_file_states_a_unit(tmp_path: Path) ->
     np.testing.assert_array_equal(log.motor_angle, table["motor_angle"])
     (finding,) = log.findings
     assert "'deg'" in finding.what and "'rad'" in finding.what
+
+
+@pytest.mark.parametrize("values", [np.full(ROWS, np.nan), np.zeros(7)], ids=["empty", "short"])
+@pytest.mark.parametrize("signal", ["temperature", "load_torque"])
+def test_useless_optional_column_is_left_out_unless_it_is_named(
+    tmp_path: Path, signal: str, values: np.ndarray
+) -> None:
+    columns: dict[str, Any] = drive_table() | {signal: values}
+    np.savez(tmp_path / "log.npz", **columns)
+    log = read_log(tmp_path / "log.npz", read_drive(tmp_path))
+    assert getattr(log, signal) is None and len(log) == ROWS
+    assert [(f.severity, f.where) for f in log.findings] == [("note", signal)]
+    with pytest.raises(InputError):
+        read_log(tmp_path / "log.npz", read_drive(tmp_path, DRIVE + f'[columns]\n{signal} = "{signal}"\n'))
+
+
+def test_short_velocity_that_is_only_checked_is_left_out(tmp_path: Path) -> None:
+    columns: dict[str, Any] = drive_table() | {"motor_velocity": np.zeros(7)}
+    np.savez(tmp_path / "log.npz", **columns)
+    log = read_log(tmp_path / "log.npz", read_drive(tmp_path))
+    assert log.motor_velocity is None and [f.where for f in log.findings] == ["motor_velocity"]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "frame"])
+def test_explanation_in_a_name_stated_in_full_is_no_unit(tmp_path: Path, kind: str) -> None:
+    table: dict[str, Any] = drive_table()
+    table["torque (commanded)"] = table.pop("motor_torque")
+    columns = '[columns]\nmotor_torque = "{}"\n'
+    log = pl.DataFrame(table) if kind == "frame" else save(tmp_path, table, kind)
+    drive = read_drive(tmp_path, DRIVE + columns.format("torque (commanded)"))
+    np.testing.assert_array_equal(fitting.load(log, drive).logs[0].input, table["torque (commanded)"])
+    with pytest.raises(InputError, match="'commanded' is not understood"):
+        fitting.load(log, read_drive(tmp_path, DRIVE + columns.format("torque")))

@@ -28,12 +28,28 @@ def table(
     return head + end.join(delimiter.join(row) + tail for row in cells) + end
 
 
+def pd_text() -> str:
+    """A table as pandas prints it."""
+    lines = ["    time       a", *(f"{i:3} {t:5} {a:8}" for i, (t, a) in enumerate(zip(TIME, A, strict=True)))]
+    return "\n".join(lines) + "\n"
+
+
 DIALECTS: dict[str, str | bytes] = {
     "comma": table(","),
     "semicolon": table(";"),
     "tab": table("\t"),
     "pipe": table("|"),
     "blanks": table("   "),
+    "quoted, between blanks": table("  ", quote='"'),
+    "row names of R": '"time" "a"\n'
+    + "".join(f'"{i}" {t} {a}\n' for i, (t, a) in enumerate(zip(TIME, A, strict=True))),
+    "row names of R, between commas": "time,a\n"
+    + "".join(f"{i},{t},{a}\n" for i, (t, a) in enumerate(zip(TIME, A, strict=True))),
+    "row names and units": "time;a\ns;N m\n"
+    + "".join(f"{i};{t};{a}\n" for i, (t, a) in enumerate(zip(TIME, A, strict=True))),
+    "index of pandas": pd_text(),
+    "delimiters at the ends of rows alone": table(",", tail=",").replace("b,", "b", 1),
+    "flags": "time,a,on,homed,fault\n" + "".join(f"{t},{a},True,FALSE,true\n" for t, a in zip(TIME, A, strict=True)),
     "decimal comma": table(";", decimal=","),
     "decimal comma and tabs": table("\t", decimal=","),
     "decimal comma and blanks": table(" ", decimal=","),
@@ -257,6 +273,15 @@ def test_text_without_a_table_is_refused(text: str | bytes, words: list[str]):
 def test_header_without_rows_gives_the_column_names():
     found = read("time;a;b\n")
     assert found.names == ("time", "a", "b") and found.columns == {}
+
+
+def test_quoted_names_between_blanks_may_hold_blanks():
+    assert read('"time" "motor angle"\n0 1\n1 2\n', wanted=()).names == ("time", "motor angle")
+
+
+def test_row_of_words_and_numbers_is_no_header():
+    found = read("time;mode;state\n0;ready;on\n", wanted=())
+    assert found.names == ("time", "mode", "state")
 
 
 @pytest.mark.parametrize(

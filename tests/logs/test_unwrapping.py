@@ -1,8 +1,13 @@
 """Unwrapping of angles and overflowed integers; other signals are unchanged."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from fitting.logs.channels import channel
+from fitting.logs.drive_file import drive_of
+from fitting.logs.raw_table import RawColumn
 from fitting.logs.unwrapping import unwrapped_angle, unwrapped_overflow
 
 COUNT = 4000
@@ -91,3 +96,12 @@ def test_torque_that_does_not_overflow_is_unchanged(values: np.ndarray):
     found, span, _ = unwrapped_overflow(values)
     np.testing.assert_array_equal(found, values)
     assert span == 0
+
+
+@pytest.mark.parametrize("signal", ["motor_torque", "load_torque", "joint_torque", "forcing"])
+def test_integers_of_every_torque_are_unwrapped(signal: str):
+    whole = np.rint(TORQUE * 1e3)
+    overflowed = RawColumn(np.mod(whole + 2**15, 2.0**16) - 2**15)
+    found = channel(Path("log.csv"), drive_of({}, Path("drive.toml")), signal, overflowed)
+    np.testing.assert_array_equal(found.values, whole)
+    assert [finding.severity for finding in found.findings] == ["warning"]

@@ -14,6 +14,7 @@ from report_cases import ESTIMATE_KEYS, HEALTH, HOLD, HOSTILE, T_C, VAGUE, with_
 
 import rig
 from fitting.attribution.selection_round import Verdict
+from fitting.logs.findings import Finding
 from fitting.outcome import FitOnly, Loop
 from fitting.report import Report, explained_share, report_dict, report_text
 from fitting.report.limits import limits, parameter_note
@@ -106,7 +107,7 @@ def test_report_of_a_diverged_run_has_only_finite_numbers(loop: Loop):
     found = report_dict(broken)
     assert found["before"]["rmse"]["test"] is None
     assert all(math.isfinite(v) for v in leaves(found) if isinstance(v, float))
-    assert "diverged" in report_text(found) or "much of" in report_text(found)
+    assert "It keeps free runs along test data from diverging; the error is" in found["summary"]
 
 
 def test_effects_are_ordered_by_gain_in_the_report(loop: Loop):
@@ -283,6 +284,26 @@ def test_extrapolation_in_speed_is_reported(kind: str, request: pytest.FixtureRe
     assert found["extrapolation"] == [pytest.approx(expected)]
     assert "the model extrapolates: motor speed up to" in report_text(found).replace("\n      ", " ")
     assert "the model extrapolates: motor speed up to" in write_page(tmp_path, far)
+
+
+def test_text_report_tells_warnings_of_the_health_check(loop: Loop):
+    noted = ("log", Finding("note", "the sampling jitters", "time", "the stamps are used as they are"))
+    text = report_text(report_dict(loop, health=[*HEALTH, noted]))
+    assert f"[Log health] warning: {HOSTILE}, time: 8 rows of {HOSTILE} repeat; they are left out" in text
+    assert "jitters" not in text
+
+
+def test_row_heads_of_the_text_report_fit_their_column(loop: Loop):
+    report = report_dict(loop)
+    for stage in ("before", "after"):
+        of_outputs = report[stage]["rmse_of_outputs"]
+        of_outputs["motor_velocity"] = of_outputs[report["output"]]
+    report["units"]["motor_velocity"] = "rad/s"
+    lines = report_text(report).splitlines()
+    rows = [line for line in lines if re.match("    (test|motor velocity|noise) ", line)]
+    assert {row[4:18].strip() for row in rows} == {"test", "motor velocity", "noise"}
+    # The first number ends where its column does.
+    assert all(row[31] != " " and row[32] == " " for row in rows)
 
 
 def test_text_report_lists_parameters_and_decision(loop: Loop):

@@ -128,6 +128,12 @@ def test_summary_claims_no_change_where_free_runs_diverge_before_and_after():
     assert said == "It explains short segments alone: free runs along test data diverge before and after."
 
 
+def test_summary_claims_no_share_where_free_runs_diverged_before():
+    said = _change("Together they", _report_with_errors(None, 2e-6, motor=(None, None)), several=True)
+    assert said.startswith("Together they keep free runs along test data from diverging; the error is 2")
+    assert "falls" not in said
+
+
 def test_values_are_rounded_to_the_second_digit_of_their_error():
     assert rounded([2113436.0, None], 4.5e5) == ["2110000", "n/a"]
     assert rounded([0.07614634681, 0.0761463485], 8.6e-10) == ["0.07614634681", "0.07614634850"]

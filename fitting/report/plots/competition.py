@@ -5,6 +5,7 @@ import html
 import numpy as np
 
 from fitting.attribution.selection_round import Round, Verdict
+from fitting.report.outputs import in_words
 from fitting.report.plots.axes import (
     AFTER,
     FAINT,
@@ -62,7 +63,7 @@ def competition(this: Round, turn: int) -> Plot:
         "annotations": [note("chance (99 %)", x=float(np.log10(chance)) if wide else chance)],
         "bargap": 0.3,
     }
-    outcome = f"{_plain(this.winner.name)} is accepted" if this.accepted else "none is accepted"
+    outcome = f"{in_words(this.winner.name)} is accepted" if this.accepted else "none is accepted"
     return Plot(
         f"competition-{turn}",
         "found",
@@ -75,11 +76,7 @@ def competition(this: Round, turn: int) -> Plot:
 
 
 def _form_name(verdict: Verdict) -> str:
-    return html.escape(_plain(verdict.name)) + " "
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")
+    return html.escape(in_words(verdict.name)) + " "
 
 
 def _is_accepted(verdict: Verdict, this: Round) -> bool:
