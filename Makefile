@@ -10,7 +10,7 @@ INSTALLED := .venv/.installed
 help:
 	@echo "make demo   install, then close the loop on a simulated drive and write a report"
 	@echo "make test   the whole gate: ruff, pyright, import contracts, pytest"
-	@echo "make slow   the tests that take minutes"
+	@echo "make slow   the tests that take minutes, with shapes checked at every call"
 	@echo "make bench  the benchmarks, side by side with their peers"
 	@echo "make docs   renew the pages made from the code, and build the site into build/site"
 	@echo "make lock   resolve requirements.lock afresh"
@@ -36,7 +36,7 @@ test: $(INSTALLED)
 	$(BIN)/python -m pytest
 
 slow: $(INSTALLED)
-	$(BIN)/python -m pytest -m slow
+	HDJAX_CHECKS=inf $(BIN)/python -m pytest -m slow
 
 bench: $(INSTALLED)
 	@set -e; for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done

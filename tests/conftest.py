@@ -10,7 +10,7 @@ import jax
 import jaxtyping
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
-from shape_checks import checked
+from shape_checks import CALLS, checked
 
 # Tests spend more time on compilation than on computation. XLA reads this when the first program is compiled, also in
 # processes that tests start. A user's command compiles with more optimisation, see `jit_small`.
@@ -31,7 +31,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # The first example of a property compiles, so that time limits have no meaning. Examples are the same in every run:
 # the result of the gate depends on the code alone.
 hypothesis.settings.register_profile(
-    "gate", deadline=None, derandomize=True, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+    "gate", deadline=None, derandomize=True, max_examples=40, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("gate")
 
@@ -47,6 +47,15 @@ jaxtyping.jaxtyped = checked  # which the hook puts at each function and class
 jaxtyping.install_import_hook(
     [".".join(f.relative_to(ROOT).with_suffix("").parts) for f in _SHAPED], "beartype.beartype"
 )
+
+
+# Files that take longest: begun last, one would keep a process busy while the others have nothing left to do.
+_FIRST = ("test_one_side_check.py", "test_notebooks.py", "test_close_loop.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Move the tests of the longest files to the front."""
+    items.sort(key=lambda item: _FIRST.index(item.path.name) if item.path.name in _FIRST else len(_FIRST))
 
 
 @pytest.fixture(scope="session")
@@ -74,7 +83,11 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 @pytest.fixture(autouse=True, scope="module")
 def few_programs() -> Iterator[None]:
     """Clear compiled programs before their memory mappings reach the limit of the system (65,530 on Linux), at which a
-    compilation crashes."""
+    compilation crashes.
+
+    What is checked in a file depends on the file alone.
+    """
+    CALLS.clear()
     yield
     mappings = Path("/proc/self/maps")
     if mappings.exists() and mappings.read_text().count("\n") > 20_000:

@@ -3,6 +3,7 @@
 The equations of motion are written independently in numpy (DESIGN 2.1), without hdjax' simulator.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -77,6 +78,14 @@ def motion_of(joint: Joint, torque: np.ndarray, *, step: float = STEP, substeps:
     return rig.rk4(rates, (0.0,) * 5, torque, step, substeps)[:, :4]
 
 
+@functools.cache
+def _motion_at(joint: Joint, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Torque and motion of a log; many tests read the same motion through other sensors."""
+    torque = torque_of(joint, count=count, seed=seed)
+    return torque, motion_of(joint, torque)
+
+
+@functools.cache
 def with_friction(joint: Joint, coulomb: float, viscous: float, *, seed: int = 0) -> Joint:
     """The joint with Coulomb and viscous friction as shares of the rms torque in its motion."""
     torque = torque_of(joint, seed=seed)
@@ -87,6 +96,7 @@ def with_friction(joint: Joint, coulomb: float, viscous: float, *, seed: int = 0
     return joint
 
 
+@functools.cache
 def drawn(seed: int) -> Joint:
     """A joint with a natural frequency from 3 to 15 Hz, and friction of up to 60 % of the rms torque of either kind."""
     random = np.random.default_rng(seed)
@@ -105,8 +115,7 @@ def drawn(seed: int) -> Joint:
 def log_of(joint: Joint, *, seed: int = 0, count: int = COUNT, name: str = "joint") -> Log:
     """The joint's log; the encoders' noise at the output is a thousandth of the twist's rms."""
     random = np.random.default_rng(10_000 + seed)
-    torque = torque_of(joint, count=count, seed=seed)
-    motion = motion_of(joint, torque)
+    torque, motion = (a.copy() for a in _motion_at(joint, count, seed))
     noise = 1e-3 * np.std(motion[:, 0] / joint.N - motion[:, 1])
     motor = motion[:, 0] + joint.N * noise * random.normal(size=count)
     load = motion[:, 1] + noise * random.normal(size=count)
@@ -118,8 +127,8 @@ def log_of_sensors(
 ) -> Log:
     """The joint's log of some sensors, with white noise as a share of the signal that the twist causes in each."""
     random = np.random.default_rng(20_000 + seed)
-    torque = torque_of(joint, count=count, seed=seed)
-    theta_m, theta_l, omega_m, omega_l = motion_of(joint, torque).T
+    torque, motion = (a.copy() for a in _motion_at(joint, count, seed))
+    theta_m, theta_l, omega_m, omega_l = motion.T
     x, v = theta_m / joint.N - theta_l, omega_m / joint.N - omega_l
     tau = joint.K * (x + joint.alpha * x**3) + joint.B_sp * v
     read = {

@@ -1,5 +1,6 @@
 """Logs and drive files with random faults: bytes, columns, units, types, sizes and shapes."""
 
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -18,17 +19,22 @@ DRIVE = {
 
 
 def healthy(seed: int) -> Table:
-    """Columns of a valid drive log or, for every fifth seed, of a reduced log."""
+    """Columns of a valid drive log or, for every fifth seed, of a reduced log; the caller may write in them."""
+    return {name: column.copy() for name, column in _healthy(seed).items()}
+
+
+@functools.cache
+def _healthy(seed: int) -> Table:
     if seed % 5 == 4:
         forcing = rig.reduced_forcing(ROWS, seed=seed)
         log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0], forcing, noise=1e-3, seed=seed)
-        return {"time": log.time.copy(), "dynamic_error": log.dynamic_error, "forcing": forcing}
+        return {"time": log.time, "dynamic_error": log.dynamic_error, "forcing": forcing}
     torque = rig.drive_torque(ROWS, seed=seed)
     log = rig.drive_log(rig.drive_motion(torque), torque, seed=seed)
     return {
-        "time": log.time.copy(),
-        "motor_angle": log.motor_angle.copy(),
-        "load_angle": log.load_angle.copy(),
+        "time": log.time,
+        "motor_angle": log.motor_angle,
+        "load_angle": log.load_angle,
         "motor_torque": torque,
     }
 

@@ -208,7 +208,7 @@ def test_single_precision_is_refused():
         jax.config.update("jax_enable_x64", True)
 
 
-@pytest.mark.parametrize("drifting", ["training", "selection"])
+@pytest.mark.parametrize("drifting", ["training", pytest.param("selection", marks=pytest.mark.slow)])
 def test_effect_that_does_not_explain_free_runs_is_unexplained(drifting: str, monkeypatch: pytest.MonkeyPatch):
     """An effect found over short segments is reported where no term can be learned; the decision is `unexplained`."""
 

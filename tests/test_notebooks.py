@@ -13,7 +13,15 @@ from traitlets.config import Config
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+# Their measures are pinned by other tests.
+LONG = ("alpha_excitation", "damping_study")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=pytest.mark.slow if p.stem in LONG else ()) for p in NOTEBOOKS],
+    ids=lambda p: p.stem,
+)
 def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
     # The shell replaces the module `__main__`.
@@ -29,4 +37,4 @@ def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_notebooks_exist():
-    assert NOTEBOOKS
+    assert set(LONG) < {p.stem for p in NOTEBOOKS}

@@ -1,9 +1,10 @@
-"""Every call in these tests is checked: shapes, types, and that equal names of sizes are equal numbers."""
+"""The first calls in each test file are checked: shapes, types, and that equal names of sizes are equal numbers."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import shape_checks
 from beartype import beartype
 from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float
@@ -60,3 +61,16 @@ def test_valid_calls_pass():
 def test_invalid_call_is_refused(call):
     with pytest.raises(BeartypeCallHintViolation):
         call()
+
+
+def test_only_the_first_calls_are_checked(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shape_checks, "MOST", 2)
+
+    @checked(typechecker=beartype)
+    def same(a: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return a
+
+    for _ in range(2):
+        with pytest.raises(BeartypeCallHintViolation):
+            same([1.0])
+    assert same([1.0]) == [1.0]

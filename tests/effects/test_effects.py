@@ -4,7 +4,6 @@ import functools
 from dataclasses import replace
 
 import diffrax as dfx
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from simulated_outputs import BASE, START, STEP, TIME, TORQUE, outputs, rms, slo
 import hdjax.effects
 from fitting.estimation.problem import stable_substeps
 from hdjax import TwoInertiaModel, sampled
+from hdjax.compilation import jit_small
 from hdjax.effects import CATALOGUE, JointTorqueBias, JointTorqueDelay, Scales
 from hdjax.effects.creep import Creep
 from hdjax.effects.hysteresis import BoucWen, SharpBoucWen
@@ -75,6 +75,17 @@ def at_strength(form, share: float):
     return model.replace(values)
 
 
+STORE_IS_KNOWN = (BoucWen, SharpBoucWen, Creep, ExtraResonance, ResonanceBesideLoad)
+FIRST_OF_FAMILY = {form.family: form for form in reversed(CATALOGUE)}
+
+
+def over(forms):
+    """Every form, where all but the first of each family and those whose store of energy is known are slow."""
+    quick = {*FIRST_OF_FAMILY.values(), *STORE_IS_KNOWN}
+    marked = [pytest.param(f, marks=() if f in quick else pytest.mark.slow) for f in forms]
+    return pytest.mark.parametrize("form", marked, ids=lambda form: form.name)
+
+
 every_form = pytest.mark.parametrize("form", CATALOGUE, ids=lambda form: form.name)
 
 
@@ -102,7 +113,7 @@ def test_effect_changes_the_motion_as_its_derivative_predicts(form):
     assert 0.03 < change < 0.3 * count
 
 
-@every_form
+@over(CATALOGUE)
 def test_gradients_by_strength_and_shape_agree_with_differences(form):
     model = at_strength(form, 0.03)
     gradients = slopes(model, TORQUE, START)
@@ -132,7 +143,7 @@ NO_TORQUE = sampled(FREE_TIME, np.zeros(FREE_TIME.size), hold="zero-order")
 SPRUNG = jnp.asarray([0.2, 0.7, 3.0, 0.1]).at[0].add(50 * 0.7)  # twisted by 4 mrad off its equilibrium
 
 
-@eqx.filter_jit
+@jit_small
 def released(model):
     """States of a drive released from a twist, without torque."""
     state = model.rest().at[:4].set(SPRUNG)
@@ -216,11 +227,6 @@ DISSIPATIVE = (
     "creep",
     "extra_resonance",
 )
-STORE_IS_KNOWN = (BoucWen, SharpBoucWen, Creep, ExtraResonance, ResonanceBesideLoad)
-
-
-def forms_of(families):
-    return pytest.mark.parametrize("form", [f for f in CATALOGUE if f.family in families], ids=lambda form: form.name)
 
 
 @functools.cache
@@ -229,11 +235,7 @@ def lossless(form, share=0.2):
     return model, np.asarray(released(model))
 
 
-@pytest.mark.parametrize(
-    "form",
-    [*(f for f in CATALOGUE if f.family in CONSERVATIVE), ConservativePositionDependentStiffness],
-    ids=lambda form: form.name,
-)
+@over([*(f for f in CATALOGUE if f.family in CONSERVATIVE), ConservativePositionDependentStiffness])
 def test_conservative_effect_keeps_the_energy(form):
     model, states = lossless(form)
     found = energy(model, states)
@@ -243,7 +245,7 @@ def test_conservative_effect_keeps_the_energy(form):
     np.testing.assert_allclose(found, found[0], atol=(1e-4 if kinks else 1e-8) * abs(found[0]))
 
 
-@forms_of(DISSIPATIVE)
+@over([f for f in CATALOGUE if f.family in DISSIPATIVE])
 def test_dissipative_effect_loses_energy(form):
     model, states = lossless(form)
     found = energy(model, states)

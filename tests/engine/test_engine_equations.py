@@ -152,7 +152,10 @@ def models() -> dict[str, Model]:
     return found
 
 
-NAMES = tuple(models())
+# All but every fifth learned form are slow: they are products of the same axes.
+_LEARNED = tuple(learned_effects())
+_LONG = {name for i, name in enumerate(_LEARNED) if i % 5}
+NAMES = tuple(pytest.param(n, marks=pytest.mark.slow if n in _LONG else ()) for n in models())
 POINTS = 16
 
 

@@ -218,8 +218,14 @@ def test_machine_function_agrees_with_jax(name: str, by_jax):
     points = FUNCTIONS[name][1]
     assert_same(name, made(*points), by_jax[name])
     assert_same(name, made.by_numpy(*points), by_jax[name])
-    # Parameters are plain numbers, in one lane.
-    assert_same(name, machine_function(name, lanes=1)(*points), by_jax[name])
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if i % 4 == 0 else pytest.mark.slow) for i, n in enumerate(FUNCTIONS)]
+)
+def test_machine_function_of_one_lane_agrees_with_jax(name: str, by_jax):
+    """Parameters are plain numbers, in one lane."""
+    assert_same(name, machine_function(name, lanes=1)(*FUNCTIONS[name][1]), by_jax[name])
 
 
 def test_division_by_a_constant_uses_one_inverse(by_jax):

@@ -1,5 +1,6 @@
 """Readings of a late encoder: whole rows of the delay are found, and moved."""
 
+import functools
 import math
 from dataclasses import replace
 
@@ -18,13 +19,18 @@ from hdjax.effects.sensing import LoadEncoderDelay, MotorEncoderDelay, SensorDel
 
 COUNT = 1500
 MODEL = rig.drive_model()
-LOGS = {
-    "nothing": rig.drive_experiment(COUNT),
-    "friction of the motor": rig.drive_experiment(COUNT, motor_friction=(0.2, 1.0)),
-    "kinematic error": rig.drive_experiment(COUNT, kinematic=(1e-4, 0.0)),
-    "weight on the load": rig.drive_experiment(COUNT, gravity=5.0),
-    "backlash": rig.drive_experiment(COUNT, gap=3e-4),
+PHYSICS = {
+    "nothing": {},
+    "friction of the motor": {"motor_friction": (0.2, 1.0)},
+    "kinematic error": {"kinematic": (1e-4, 0.0)},
+    "weight on the load": {"gravity": 5.0},
+    "backlash": {"gap": 3e-4},
 }
+
+
+@functools.cache
+def log_with(effect: str) -> Experiment:
+    return rig.drive_experiment(COUNT, **PHYSICS[effect])
 
 
 def with_late_load(experiment: Experiment, rows: int) -> Experiment:
@@ -34,11 +40,11 @@ def with_late_load(experiment: Experiment, rows: int) -> Experiment:
     return replace(experiment, measured=np.stack([turn, turn - load], axis=1))
 
 
-@pytest.mark.parametrize("beside", LOGS)
+@pytest.mark.parametrize("beside", PHYSICS)
 @pytest.mark.parametrize("rows", [-7, 0, 10])
 def test_whole_rows_between_the_encoders_are_found_beside_any_effect(beside: str, rows: int):
     """To a row where the effect bends the phase of the load as well; no delay is claimed where there is none."""
-    late = with_late_load(LOGS[beside], rows)
+    late = with_late_load(log_with(beside), rows)
     found = delay_of_load(MODEL, (Stretch(late, 20, COUNT - 20),)) / rig.STEP
     off = 1 if rows and beside in ("kinematic error", "backlash") else 0
     assert abs(found - rows) < off + 1e-6
@@ -93,7 +99,8 @@ def test_friction_of_the_mesh_over_many_turns_is_no_delay(seed: int):
 
 
 def test_delay_is_not_looked_for_where_the_twist_was_not_measured():
-    motor = replace(LOGS["nothing"], measured=LOGS["nothing"].measured[:, :1], outputs=("motor_angle",))
+    both = log_with("nothing")
+    motor = replace(both, measured=both.measured[:, :1], outputs=("motor_angle",))
     model = TwoInertiaModel(MODEL.drive, measured=("motor_angle",))
     assert delay_of_load(model, (Stretch(motor, 0, COUNT),)) == 0.0
 
@@ -102,7 +109,7 @@ def test_delay_is_not_looked_for_where_the_twist_was_not_measured():
 @given(rows=st.integers(-9, 9), invalid=st.integers(20, COUNT - 20))
 def test_moved_readings_are_those_of_the_undelayed_encoder(rows: int, invalid: int):
     """Rows whose reading lies beyond the log or is invalid are invalid; moving back restores the others."""
-    logged = LOGS["nothing"]
+    logged = log_with("nothing")
     weight = np.ones(COUNT)
     weight[invalid] = 0.0
     late = replace(with_late_load(logged, rows), weight=weight)
@@ -120,7 +127,7 @@ def test_moved_readings_are_those_of_the_undelayed_encoder(rows: int, invalid: i
 def test_laws_of_aligned_delays_span_at_most_half_a_row(load: float, motor: float):
     effects = LoadEncoderDelay(delay=load * rig.STEP), MotorEncoderDelay(delay=motor * rig.STEP)
     late = MODEL.with_effects(*effects)
-    model, (stretch,) = aligned(late, (Stretch(LOGS["nothing"], 0, COUNT),))
+    model, (stretch,) = aligned(late, (Stretch(log_with("nothing"), 0, COUNT),))
     assert is_aligned(model, (stretch,))
     own = [e for e in model.effects if isinstance(e, SensorDelay)]
     assert all(abs(float(e.load_delay())) <= 0.5001 * rig.STEP for e in own)

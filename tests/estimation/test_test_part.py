@@ -1,6 +1,8 @@
 """Test data are used by the final figures only."""
 
+import functools
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+import fitting.loop
 import rig
 from fitting.commands.run_fit import close_loop_on_logs
 from fitting.drive_data import read_rig
@@ -15,6 +18,7 @@ from fitting.estimation.test_part import parted
 from fitting.logs.drive_file import read_drive_file
 from fitting.logs.log import read_log
 from fitting.search_options import SearchOptions
+from hdjax.effects import CATALOGUE, Effect, MotorFriction, TorqueBias
 
 COUNT, TEST = 1500, 300
 OUTPUTS = ("motor_angle", "load_angle")
@@ -55,7 +59,14 @@ def without_test(found: dict) -> dict:
     return kept
 
 
-def test_scrambled_test_data_change_only_the_test_figures(tmp_path: Path):
+@pytest.mark.parametrize(
+    "catalogue", [(MotorFriction, TorqueBias), pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["few", "all"]
+)
+def test_scrambled_test_data_change_only_the_test_figures(
+    catalogue: Sequence[type[Effect]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    close_loop = functools.partial(fitting.loop.close_loop, catalogue=catalogue)
+    monkeypatch.setattr(fitting.loop, "close_loop", close_loop)
     found = []
     for scrambled in (False, True):
         folder = tmp_path / str(scrambled)

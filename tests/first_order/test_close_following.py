@@ -12,15 +12,15 @@ from fitting.first_order.close_following import followed_closely
 from fitting.first_order.linearised_fit import motion_states
 from hdjax import Drive, TwoInertiaModel
 
-JOINT = joints.with_friction(joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05), 0.5, 0.5)
 COUNT = 1500
 
 
 def test_closely_followed_motor_speed_is_accurate_under_missing_friction():
-    torque = joints.torque_of(JOINT, count=COUNT)
-    truth = joints.motion_of(JOINT, torque)[:, 2]
-    experiment = experiment_from_log(joints.log_of(JOINT, count=COUNT), hold="zero-order", N=JOINT.N)
-    model = TwoInertiaModel(Drive(N=JOINT.N, J_m=JOINT.J_m, J_l=JOINT.J_l, K=JOINT.K, B_sp=JOINT.B_sp))
+    joint = joints.with_friction(joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05), 0.5, 0.5)
+    torque = joints.torque_of(joint, count=COUNT)
+    truth = joints.motion_of(joint, torque)[:, 2]
+    experiment = experiment_from_log(joints.log_of(joint, count=COUNT), hold="zero-order", N=joint.N)
+    model = TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=joint.K, B_sp=joint.B_sp))
     # Horizons of 1024 samples in segments of 256; the data fill the last segment only in part.
     found = fit(
         model,

@@ -26,7 +26,7 @@ def exported(
     return columns, {f"ch{k + 2}": (signal, *truth[signal][1:]) for k, signal in enumerate(order)}
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(
     N=st.sampled_from([30.0, 50.0, 80.0, 101.0, 121.0]),
     inertias=st.floats(0.2, 2.0),
@@ -59,7 +59,7 @@ def test_signals_units_and_signs_are_detected_without_names(
     assert ratio.value == N or not ratio.sure
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(seeds=st.lists(st.integers(0, 1000), min_size=4, max_size=4, unique=True), walks=st.booleans())
 def test_unrelated_channels_are_not_detected_as_signals(seeds: list[int], walks: bool):
     columns: dict[str, np.ndarray] = {"t": np.arange(3000) / 500.0}

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 import slow_joints
 from slow_joints import RATIO, Effect, closed, slow_joint
-from test_quasi_static_loop import RIPPLE, families, lara8_points
+from test_quasi_static_loop import RIPPLE, families
 
 from fitting.logs.drive_file import DriveFile
 from fitting.quasi_static.attribution import Held
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.lookalikes import lookalikes
-from fitting.quasi_static.loop import QuasiStaticLoop, close_loop
+from fitting.quasi_static.loop import QuasiStaticLoop
 from fitting.quasi_static.loop_content import loop_report
 from fitting.quasi_static.plots import loop_pictures
 from fitting.quasi_static.points import points_of
@@ -118,17 +118,6 @@ def test_load_friction_is_a_lookalike_of_creep_at_rest() -> None:
     points = points_of([log], [how], RATIO)
     assert "load_friction" in dict(lookalikes("creep", points, at_rest=True))
     assert "load_friction" not in dict(lookalikes("creep", points))
-
-
-def test_relaxation_of_a_measured_gear_at_rest_is_identified(shared: Path, tmp_path: Path) -> None:
-    loop = close_loop(lara8_points(shared, tmp_path, "ML2_jogging_joint_mass", 2, 121, -1))
-    assert families(loop) == {"kinematic_error", "creep"}
-    known = figures(loop)
-    # From row 30 of the rest on, an exponential of 0.5 s leaves 1.69 µrad of 10.6; differences of rows have 1.59 µrad.
-    assert known["time_constant"].value == pytest.approx(0.5, rel=0.1)
-    assert loop.at_rest is not None and loop.at_rest.after.rmse < 2e-6 < 0.3 * loop.at_rest.round.before.rmse
-    # The page also states the stiffness with which the twist would follow the logged torque.
-    assert loop.at_rest.own_stiffness is not None and 6e4 < loop.at_rest.own_stiffness < 1.2e5
 
 
 def test_report_describes_a_relaxation_at_rest(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ OMEGA_0 = float(DRIVE.omega_0)
 def branch(alpha: float = 0.0, B_sp: float = 2.0) -> Branch:
     drive = dataclasses.replace(DRIVE, alpha=alpha, B_sp=B_sp)
     model = TwoInertiaModel(drive, (KinematicError(cos_2=ERROR),))
-    return frequency_response(model, None, 0.2 * OMEGA_0, 0.8 * OMEGA_0, rotating=True, harmonics=6, points=300)
+    return frequency_response(model, None, 0.2 * OMEGA_0, 0.8 * OMEGA_0, rotating=True, harmonics=4, points=150)
 
 
 def closed_form(speed: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from fitting.estimation.problem import Segmentation
 from fitting.uncertainty.sandwich import Linearised, Record, covariance, linearised
 from fitting.uncertainty.standard_errors import uncertainty
 
-COUNT, DRAWS = 2000, 400
+COUNT, DRAWS = 2000, 200
 PERIOD = 16.0
 Noise = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 
