@@ -6,9 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-LEAD = 12
-"""Lead-in samples of a segment in which the filter converges, and which the likelihood omits."""
-
+# Lead-in samples of a segment in which the filter converges.
+_LEAD = 12
 # Axes of matrices, for `numpy.matmul`.
 _FIRST_TWO: list[Any] = [(0, 1)] * 3
 
@@ -60,6 +59,7 @@ class Steps(eqx.Module):
         start: expected deviation of the initial states.
         prior: covariance of the initial states.
         torque: rms torque of each log.
+        lead: lead-in samples of the filter, which the likelihood omits.
     """
 
     transition: Float[np.ndarray, "samples states states segments"]
@@ -71,6 +71,7 @@ class Steps(eqx.Module):
     start: Float[np.ndarray, "states segments"]
     prior: Float[np.ndarray, "states states"]
     torque: Float[np.ndarray, " logs"]
+    lead: int = eqx.field(static=True, default=_LEAD)
 
     def fewer(self, segments: int) -> "Steps":
         """The same for at most so many segments, evenly spaced."""
@@ -93,8 +94,8 @@ def filtered(
     """Standardised innovations after the lead-in, at the parameters that minimise them, and logarithms of their
     standard deviations, for several noise settings at once."""
     errors, variances = _predicted(steps, np.square(std)[:, steps.log], sensors)
-    errors, variances = errors[LEAD:].transpose(3, 4, 0, 1, 2), variances[LEAD:].transpose(2, 3, 0, 1)
-    counts = steps.counts[LEAD:].T[..., None]
+    errors, variances = errors[steps.lead :].transpose(3, 4, 0, 1, 2), variances[steps.lead :].transpose(2, 3, 0, 1)
+    counts = steps.counts[steps.lead :].T[..., None]
     found = np.ascontiguousarray(errors * (counts / np.sqrt(variances))[..., None])
     used = found.reshape(len(std), -1, found.shape[-1])
     innovations, derivatives = used[..., :1], used[..., 1:]

@@ -17,7 +17,7 @@ from fitting.estimation.estimate import Fit, log_of, segments_by
 from fitting.estimation.linear_response import follow
 from fitting.estimation.problem import with_hidden_states
 from fitting.estimation.residual import RUNAWAY, Problem, Unknowns
-from fitting.uncertainty.innovations import LEAD, SensorNoise, Steps, filtered, spread_evenly, white_noise
+from fitting.uncertainty.innovations import SensorNoise, Steps, filtered, spread_evenly, white_noise
 from fitting.uncertainty.input_noise import torque_pushes
 from hdjax import Model, TwoInertiaModel
 
@@ -124,7 +124,7 @@ def _judged(steps: Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoi
     """Innovation statistics under noise of given size."""
     innovations, logarithms = filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
     std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
-    counts, logs = steps.counts[LEAD:], [steps.log == i for i in range(shares.size)]
+    counts, logs = steps.counts[steps.lead :], [steps.log == i for i in range(shares.size)]
     each = [_size_and_colour(innovations[0, own], float(counts[:, own].sum())) for own in logs]
     size, colour = np.max(each, axis=0)
     samples = int(counts.sum())

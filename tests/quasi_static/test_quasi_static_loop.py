@@ -51,8 +51,8 @@ def assert_few_false_alarms(draws: int, most: int, options: dict) -> None:
 
 @pytest.mark.parametrize("options", NO_EFFECT)
 def test_no_effect_is_found_where_none_is_missing(options: dict) -> None:
-    # At a false-alarm rate of 2 %, two alarms in two occur once in 2500.
-    assert_few_false_alarms(2, 1, options)
+    # The slow test bounds the rate; the draws of this one are fixed, and have no alarm.
+    assert_few_false_alarms(2, 0, options)
 
 
 @pytest.mark.slow
