@@ -22,21 +22,21 @@ from hdjax.simulate import march
 from hdjax.where import where
 
 _HALVINGS = 50
+# Solver steps in a sample interval.
+_SUBSTEPS = 2
 OTHERS = ("alpha", "K", "B_sp")
 
 
-class PlannedLog(eqx.Module):
-    """A log that starts at rest under the case's motor torque, with zero-order hold.
+class LogMeasure(Measure):
+    """A measure of a planned log, which starts at rest under the case's motor torque, with zero-order hold.
 
     Attributes:
         rate: samples a second [Hz].
         duration: length of the log [s].
-        substeps: solver steps in a sample interval.
     """
 
-    rate: float
-    duration: float
-    substeps: int = 2
+    rate: eqx.AbstractVar[float]
+    duration: eqx.AbstractVar[float]
 
     @property
     def samples(self) -> int:
@@ -48,20 +48,8 @@ class PlannedLog(eqx.Module):
         time = jnp.arange(self.samples + 1.0) / self.rate
         torque = PiecewisePolynomial(time, jax.vmap(case.excitation)(time[:-1])[:, None])
         model = ReducedModel(case.drive.reduced())
-        states, _ = march(model, torque, None, start, solver=dfx.Tsit5(), substeps=self.substeps)
+        states, _ = march(model, torque, None, start, solver=dfx.Tsit5(), substeps=_SUBSTEPS)
         return states[:, 0]
-
-
-class LogMeasure(Measure):
-    """A measure of a planned log."""
-
-    rate: eqx.AbstractVar[float]
-    duration: eqx.AbstractVar[float]
-
-    @property
-    def log(self) -> PlannedLog:
-        """The log."""
-        return PlannedLog(self.rate, self.duration)
 
     def refuse(self, case: Case) -> None:
         if case.model.effects:
@@ -84,7 +72,7 @@ class LargestTwist(LogMeasure):
     duration: float
 
     def __call__(self, case: Case) -> Array:
-        sizes = jnp.abs(self.log.errors(case, jnp.zeros(2)))
+        sizes = jnp.abs(self.errors(case, jnp.zeros(2)))
         # The maximum of the parabola through the largest sample and its neighbours, which is smooth from sample to
         # sample.
         k = jnp.clip(jnp.argmax(sizes), 1, sizes.size - 2)
@@ -136,13 +124,12 @@ class IdentificationTime(LogMeasure):
 
     def standard_errors(self, case: Case) -> Float[Array, " samples"]:
         """Standard error of alpha over alpha, of logs that end at each sample."""
-        log = self.log
-        size = jax.lax.stop_gradient(jnp.max(jnp.abs(log.errors(case, jnp.zeros(2)))))
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(self.errors(case, jnp.zeros(2)))))
         units = size * jnp.stack([jnp.ones(()), jax.lax.stop_gradient(case.drive.omega_0)])
 
         def errors(change: Array) -> Array:
             changed = case.replace({p: case.model.get(p) * jnp.exp(change[i]) for i, p in enumerate(OTHERS)})
-            return log.errors(changed, units * change[len(OTHERS) :])
+            return self.errors(changed, units * change[len(OTHERS) :])
 
         slopes = jax.jacfwd(errors)(jnp.zeros(len(OTHERS) + 2)) / self.noise
         information = jnp.cumsum(slopes[:, :, None] * slopes[:, None, :], axis=0)

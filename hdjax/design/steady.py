@@ -28,6 +28,8 @@ HARMONICS = 5
 _ANOTHER = 1e-3
 _CORRECTIONS = 4
 _SOLVED = 1e-7
+# Motions along a branch, and steps of its continuation at most.
+_ROWS, _STEPS = 60, 120
 
 
 class Range(eqx.Module):
@@ -36,34 +38,29 @@ class Range(eqx.Module):
     Attributes:
         slow: lowest [rad/s].
         fast: highest [rad/s].
-        rows: number of motions along the branch.
-        steps: of the continuation, at most.
     """
 
     slow: Scalar
     fast: Scalar
-    rows: int = 60
-    steps: int = 120
 
 
-def balanced(case: Case, *, rotating: bool, harmonics: int = HARMONICS) -> BalancedMotion:
+def balanced(case: Case, *, rotating: bool) -> BalancedMotion:
     """The balance of a case; without effects that of the dynamic error alone, which is the same motion and cheaper.
 
     Args:
         case: drive and torques.
         rotating: the motor turns at the speeds of the range and its kinematic error excites it; the torques are not
             used.
-        harmonics: of the motion.
     """
     torque, load = case.excitation.amplitude, case.excitation.load_amplitude
     if rotating:
-        return balance(case.model, None, harmonics=harmonics, rotating=True)
+        return balance(case.model, None, harmonics=HARMONICS, rotating=True)
     if case.model.effects:
         forcing, load_torque = (harmonic_series(1.0, t) for t in (torque, load))
-        return balance(case.model, forcing, load_torque=load_torque, harmonics=harmonics)
+        return balance(case.model, forcing, load_torque=load_torque, harmonics=HARMONICS)
     reduced = case.drive.reduced()
     forcing = harmonic_series(1.0, case.drive.error_forcing(torque, load) / reduced.gain)
-    return balance(ReducedModel(reduced), forcing, harmonics=harmonics)
+    return balance(ReducedModel(reduced), forcing, harmonics=HARMONICS)
 
 
 def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
@@ -74,7 +71,7 @@ def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
     still = jax.lax.stop_gradient(system)
 
     def of_one(start: Array, end: Array) -> Branch:
-        branch = follow(still, "omega", start, end, points=ranges[0].rows, steps=ranges[0].steps)
+        branch = follow(still, "omega", start, end, points=_ROWS, steps=_STEPS)
         return jax.lax.stop_gradient(branch.within(jnp.minimum(start, end), jnp.maximum(start, end)))
 
     starts, ends = zip(*((r.slow, r.fast) for r in ranges), strict=True)

@@ -115,14 +115,13 @@ def structure(model: Any, paths: Sequence[str], signals: Sequence[str]) -> Hasha
     return tree, fixed_tree, whole, tuple(a.shape for a in leaves), tuple(paths), tuple(signals)
 
 
-def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slopes: bool = True) -> Equations:
+def equations(model: Model, paths: Sequence[str], signals: Sequence[str]) -> Equations:
     """Translate a model.
 
     Args:
         model: its values don't matter, except for integers and truth values.
         paths: dotted paths of the parameters of the derivatives.
         signals: inputs other than the torque.
-        slopes: whether to include derivatives.
 
     Raises:
         UntranslatableError: the model uses an unsupported function.
@@ -199,7 +198,7 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
 
     def part(nodes: Sequence[Any]) -> Part:
         flat: tuple[Any, ...] = tuple(n[()] if isinstance(n, np.ndarray) else n for n in nodes)
-        found = derivatives(graph, flat, seeds) if slopes else dict.fromkeys(flat, {})
+        found = derivatives(graph, flat, seeds)
         return Part(flat, tuple(found[n] for n in flat))
 
     return Equations(

@@ -37,11 +37,10 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
         request: of the sweep.
     """
     pilot, other = drawn_points(request)
-    reference = TransientRoute(
-        "adaptive", _looks(case, request, pilot), tolerance=min(_REFERENCE, 1e-3 * request.tolerance)
-    )
     values, others = request.points.values(pilot), request.points.values(other)
-    route = _cheapest(case, request, values, transients(case, request, reference, values))
+    turns = _turns_per_window(case, request, values)
+    reference = TransientRoute("adaptive", _looks(turns), tolerance=min(_REFERENCE, 1e-3 * request.tolerance))
+    route = _cheapest(case, request, values, transients(case, request, reference, values), turns)
     truth = transients(case, request, reference, others)
     for attempts in range(_ATTEMPTS, 0, -1):
         errors, unfinished = _errors(transients(case, request, route, others), truth)
@@ -63,9 +62,10 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
     return route, check
 
 
-def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, np.ndarray]) -> TransientRoute:
+def _cheapest(
+    case: Case, request: Request, values: dict, truth: tuple[Windows, np.ndarray], turns: float
+) -> TransientRoute:
     """The cheapest route within half the tolerance on the pilot."""
-    turns = _turns_per_window(case, request, values)
     split = splits(case.model, case.forcing)
     singles = (True, False) if split and request.tolerance >= _SINGLE_FROM else (False,)
     for single in singles:
@@ -87,7 +87,7 @@ def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, 
                 found = needed(other, most) or found
         if found is not None:
             return found
-    return TransientRoute("adaptive", _looks_for(turns), tolerance=0.01 * request.tolerance)
+    return TransientRoute("adaptive", _looks(turns), tolerance=0.01 * request.tolerance)
 
 
 def _fewest_steps(
@@ -135,10 +135,6 @@ def _turns_per_window(case: Case, request: Request, values: dict) -> float:
     return float(jnp.max(fastest * longest)) / (2 * math.pi) / request.windows
 
 
-def _looks(case: Case, request: Request, points: np.ndarray) -> int:
-    return _looks_for(_turns_per_window(case, request, request.points.values(points)))
-
-
-def _looks_for(turns: float) -> int:
+def _looks(turns: float) -> int:
     """Points between which the largest |x| is searched, enough for a motion twice as fast as a linear one."""
     return max(4, math.ceil(2 * _LOOKS_PER_TURN * turns))
