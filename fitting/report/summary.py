@@ -163,9 +163,9 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
         )
     if after is None and before is None:
         return f"{subject} explain{s} short segments alone: free runs along {on} data diverge before and after."
-    if before is None and after is not None:
+    if before is None:
         return f"{subject} keep{s} free runs along {on} data from diverging; the error is {now}."
-    if after is None or (before is not None and after > before):
+    if after is None or after > before:
         where = f"short segments alone; over whole stretches of {on} data the error rises"
         return f"{subject} explain{s} {where} from {then} to {now}."
     return f"{subject} remove{s} {_removed(before, after)} of the error on {on} data, which falls from {then} to {now}."

@@ -4,6 +4,7 @@ import numpy as np
 
 from fitting.attribution.effect_evidence import Evidence
 from fitting.formatting import axis_label, pretty_unit
+from fitting.report.outputs import in_words
 from fitting.report.plots.axes import AFTER, BEFORE, INK, axis, figure, numbers
 from fitting.report.plots.plot import Figure, Plot
 
@@ -31,16 +32,16 @@ def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
         "yaxis": axis(axis_label("torque", pretty_unit(units["torque"])), exponentformat="power"),
     }
     caption = (
-        f"Contribution of {_plain(found.effect)} along the fitted motion. With error bars (95 %): the torque estimated "
-        "from the data at this place without a law, with all other parameters as fitted. Under the right law, the "
-        "points agree with it."
+        f"Contribution of {in_words(found.effect)} along the fitted motion. With error bars (95 %): the torque "
+        "estimated from the data at this place without a law, with all other parameters as fitted. Under the right "
+        "law, the points agree with it."
     )
     if len(found.told) > 1:
         caption += " The two directions of motion are estimated separately."
     return Plot(
         f"evidence-{found.effect.replace('_', '-')}",
         "found",
-        f"{_plain(found.effect).capitalize()} in the data",
+        f"{in_words(found.effect).capitalize()} in the data",
         caption,
         figure([cloud, *_told(found)], 380, **layout),
     )
@@ -69,7 +70,3 @@ def _told(found: Evidence) -> list[Figure]:
             }
         )
     return traces
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")
