@@ -14,7 +14,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
 
 
 # Their measures are pinned by other tests.
-LONG = ("alpha_excitation", "damping_study")
+LONG = ("alpha_excitation", "close_the_loop", "damping_study")
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,24 @@
 """Intervals of parameters under model discrepancy."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from fitting import formatting
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round
 from fitting.outcome import Loop, kept_rounds
-from fitting.validation.derived_quantities import drive_figures
-from hdjax import Model
+from fitting.uncertainty.standard_errors import uncertainty
+from fitting.validation.derived_quantities import derived, drive_figures
 
 NOT_COVERED = "not covered"
 """Flag of a parameter whose interval does not include model discrepancy."""
 _WITHHELD = "withheld"
 _TIED = (
-    "Intervals of the drive's parameters include tied forms of the same family, which change them by more than a "
-    "standard error."
+    "Intervals of the drive's parameters include those of tied forms of the same family, which exceed them by more "
+    "than a standard error."
 )
 
 
@@ -25,10 +28,11 @@ def is_withheld(estimate: Mapping[str, Any]) -> bool:
 
 
 def widen_by_ties(after: dict[str, Any], outcome: Loop, x_max: float) -> None:
-    """Extend the intervals of the drive's parameters and derived figures to all tied forms of an effect's family.
+    """Extend the intervals of the drive's parameters and derived figures to those of tied forms of an effect's family.
 
     The data determine the family but not the law, and K depends on it by more than its standard error. Forms of other
-    families may define K in another way; they are told as alternatives.
+    families may define K in another way; they are told as alternatives. Fits of the search are shorter than the final
+    one, so a tied form's interval is taken relative to that of the chosen form in the same round.
 
     Args:
         after: the final model's content in the report.
@@ -36,30 +40,50 @@ def widen_by_ties(after: dict[str, Any], outcome: Loop, x_max: float) -> None:
         x_max: the largest measured twist.
     """
     entries = after["parameters"] | after["derived"]
+    stated = {path: entry["ci95"] for path, entry in entries.items()}
     for this in kept_rounds(outcome):
-        for moves in _tied_of_the_family(this, x_max):
-            for path in moves.keys() & entries.keys():
-                entry, move = entries[path], moves[path]
-                low, high = entry["ci95"]
-                entry["ci95"] = [min(low, low + move), max(high, high + move)]
-                if abs(move) > entry["std"]:
+        for changes in _tied_of_the_family(this, x_max):
+            for path in changes.keys() & entries.keys():
+                entry, (move, wider) = entries[path], changes[path]
+                (low, high), value, ends = stated[path], entry["value"], entry["ci95"]
+                theirs = value + move + wider * (low - value), value + move + wider * (high - value)
+                entry["ci95"] = [min(ends[0], theirs[0]), max(ends[1], theirs[1])]
+                if max(low - theirs[0], theirs[1] - high) > entry["std"]:
                     entry["note"] = entry.get("note") or _TIED
 
 
-def _tied_of_the_family(this: Round, x_max: float) -> Iterator[dict[str, float]]:
-    """By how much each tied form of the chosen one's family changes the drive's figures."""
+class _Change(NamedTuple):
+    """How much a tied form moves a figure, and how many times as uncertain it is."""
+
+    move: float
+    wider: float
+
+
+def _tied_of_the_family(this: Round, x_max: float) -> Iterator[dict[str, _Change]]:
+    """How each tied form of the chosen one's family changes the drive's figures."""
     chosen = this.winner
+    others = [v for v in this.verdicts if v is not chosen and v.family == chosen.family and not v.separable]
+    tied = [v.trial for v in others if v.trial is not None]
+    if not tied:
+        return
     assert chosen.trial is not None
-    own = _figures(chosen.trial.model, x_max)
-    for verdict in this.verdicts:
-        if verdict.trial is not None and verdict.family == chosen.family and not verdict.separable:
-            theirs = _figures(verdict.trial.model, x_max)
-            yield {path: theirs[path] - own[path] for path in own.keys() & theirs.keys()}
+    own = _figures(chosen.trial, x_max)
+    for trial in tied:
+        theirs = _figures(trial, x_max)
+        yield {path: _change(own[path], theirs[path]) for path in own.keys() & theirs.keys()}
 
 
-def _figures(model: Model, x_max: float) -> dict[str, float]:
-    known = {path: float(value) for path, (value, _) in model.parameters().items() if "." not in path}
-    return known | {name: float(value) for name, (value, _) in drive_figures(model, x_max).items()}
+def _change(own: tuple[float, float], theirs: tuple[float, float]) -> _Change:
+    wider = theirs[1] / own[1] if own[1] > 0.0 else 1.0
+    return _Change(theirs[0] - own[0], wider if np.isfinite(wider) else 1.0)
+
+
+def _figures(trial: Trial, x_max: float) -> dict[str, tuple[float, float]]:
+    """Value and standard error of the drive's parameters and derived figures."""
+    known = uncertainty(trial.training, torque_noise=False)
+    figures = derived(trial.model, known, drive_figures, x_max)
+    parameters = {path: e for path, e in known.estimates.items() if "." not in path}
+    return {name: (figure.value, figure.std) for name, figure in (parameters | figures).items()}
 
 
 def say_what_intervals_hold(report: dict[str, Any]) -> None:

@@ -40,7 +40,7 @@ def account_dict(
         x_max: the largest measured twist.
         start: the starting model, if known.
     """
-    figures, by_output = derived(account, drive_figures, x_max), account.rmse_of_outputs
+    figures, by_output = derived(account.model, account.uncertainty, drive_figures, x_max), account.rmse_of_outputs
     base = [path for path in account.uncertainty.estimates if "." not in path]
     return {
         "effects": [],
@@ -136,7 +136,7 @@ def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) ->
     entry["parameters"] = {
         path: _estimate_dict(path, account, units) for path in account.uncertainty.estimates if path.startswith(prefix)
     }
-    for name, quantity in derived(account, effect_figures, finding.name).items():
+    for name, quantity in derived(account.model, account.uncertainty, effect_figures, finding.name).items():
         unit = _unit_in_log(quantity.unit, prefix + name, account.model, units)
         entry["parameters"][prefix + name] = _derived_dict(name, quantity) | {"unit": unit}
     return entry

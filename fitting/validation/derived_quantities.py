@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
-from fitting.validation.account import Account
+from fitting.uncertainty.standard_errors import Uncertainty
 from hdjax import Drive, Model
 from hdjax.engine.pointwise import at_instants, slopes_at_instants
 
@@ -41,29 +41,32 @@ class Derived(eqx.Module):
         return self.value - half, self.value + half
 
 
-def derived(account: Account, quantities: Callable[..., Quantities], *given: float | str) -> dict[str, Derived]:
+def derived(
+    model: Model, known: Uncertainty, quantities: Callable[..., Quantities], *given: float | str
+) -> dict[str, Derived]:
     """Quantities of a fitted model with their standard errors.
 
     Args:
-        account: the fitted model's.
+        model: the fitted one.
+        known: of its parameters.
         quantities: function of the model and `given` that returns value and unit of each.
         given: further arguments of that function.
     """
-    estimates = account.uncertainty.estimates
+    estimates = known.estimates
     numbers = tuple(jnp.asarray(np.asarray(g)) if isinstance(g, float) else g for g in given)
     values = np.array([e.value for e in estimates.values()])
-    known, slopes = _values_and_slopes(account.model, tuple(estimates), values, quantities, numbers)
-    if not known:
+    told, slopes = _values_and_slopes(model, tuple(estimates), values, quantities, numbers)
+    if not told:
         return {}
     spread = np.array([e.std for e in estimates.values()])
     with np.errstate(all="ignore"):
         scaled = slopes * spread
-        variance = np.einsum("ip,pq,iq->i", scaled, np.asarray(account.uncertainty.correlation), scaled)
+        variance = np.einsum("ip,pq,iq->i", scaled, np.asarray(known.correlation), scaled)
         errors = np.sqrt(variance)
     freedom = _degrees_of_freedom(scaled, np.array([e.degrees_of_freedom for e in estimates.values()]))
     return {
         name: Derived(float(value), float(error), unit, float(own))
-        for (name, value, unit), error, own in zip(known, errors, freedom, strict=True)
+        for (name, value, unit), error, own in zip(told, errors, freedom, strict=True)
     }
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from fitting.estimation.estimate import Fit
 from fitting.estimation.whiteness import autocorrelation, left_over
 from fitting.first_order.linearised_fit import motion_states
+from fitting.uncertainty.normal_law import NORMAL_95
 from fitting.validation.welch import density
 from hdjax import TwoInertiaModel
 
@@ -75,7 +76,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         order=order,
         order_amplitude=amplitude,
         autocorrelation=autocorrelation(fit, min(200, residual.size // 4)),
-        white_limit=1.96 / np.sqrt(residual.size),
+        white_limit=NORMAL_95 / np.sqrt(residual.size),
         dependence={name: _dependence(residual, q) for name, q in quantities.items()},
         rms=float(np.sqrt(np.mean(residual**2))),
     )

@@ -55,6 +55,7 @@ def test_tie_with_a_hold_stays_in_its_round():
         assert _decided_again(this, trial, study) == (this,)
 
 
+@pytest.mark.slow
 def test_simpler_law_replaces_one_that_followed_a_missing_effect():
     """Beside the kinematic error Coulomb friction suffices; K is not extended to what it was without that error."""
     experiment = rig.drive_experiment(4000, motor_friction=(0.05, 1.0), kinematic=(2e-4, 1e-4))

@@ -40,7 +40,9 @@ def test_wider_form_adds_the_value_of_the_form_that_it_replaces():
 
 # A corner far beyond the drive's speeds: viscous friction alone.
 @pytest.mark.parametrize(
-    "friction, form", [((B * 1e5, 1e5), ViscousMotorFriction), ((2e-3, 0.1), MotorFriction)], ids=["viscous", "dry"]
+    "friction, form",
+    [((B * 1e5, 1e5), ViscousMotorFriction), pytest.param((2e-3, 0.1), MotorFriction, marks=pytest.mark.slow)],
+    ids=["viscous", "dry"],
 )
 def test_loop_finds_the_simplest_sufficient_form(friction: tuple[float, float], form: type[Effect]):
     experiment = rig.drive_experiment(COUNT, motor_friction=friction)

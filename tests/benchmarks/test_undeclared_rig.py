@@ -113,6 +113,7 @@ def test_smooth_effects_agree_with_scipy():
         y = solve_ivp(rates, (k * DT, (k + 1) * DT), y, args=(u,), method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
 
 
+@pytest.mark.slow
 def test_bouc_wen_and_bristles_agree_with_scipy():
     """Both have a kink where the rate reverses, which scipy's error control resolves."""
     p = BASE._replace(
@@ -316,6 +317,7 @@ def test_encoder_noise_has_its_rms_and_colour():
         assert neighbours == pytest.approx(2 / 3 * encoders.memory, abs=0.02)
 
 
+@pytest.mark.slow
 def test_recorded_case_is_readable_and_reproducible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(drawing, "_SIZES", ((1000.0, (1200, 1200, 800)),) * 3)
     (form,) = [f for f in FORMS if f.name == "stiffness" and f.family == "temperature"]

@@ -38,7 +38,8 @@ def test_motion_is_that_of_a_drive_with_the_other_inertia(form, path, error, see
 
 
 @pytest.mark.parametrize(
-    ("path", "gravity"), [("J_m", 0.0), pytest.param("J_l", 0.0, marks=pytest.mark.slow), ("J_l", 8.0)]
+    ("path", "gravity"),
+    [("J_m", 0.0), *(pytest.param("J_l", gravity, marks=pytest.mark.slow) for gravity in (0.0, 8.0))],
 )
 def test_loop_finds_a_stated_inertia_that_is_wrong(path: str, gravity: float):
     """Gravity makes the load's own equation the source of K, in proportion to the inertia as stated."""

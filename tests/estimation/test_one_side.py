@@ -218,7 +218,7 @@ def test_no_torque_is_added_where_an_equation_holds_alone(side):
 
 @pytest.mark.parametrize(
     "made",
-    [rubbing, lambda: WITH_LOAD_FRICTION, rubbing_beside_gravity],
+    [rubbing, pytest.param(lambda: WITH_LOAD_FRICTION, marks=pytest.mark.slow), rubbing_beside_gravity],
     ids=["motor rubs", "load rubs", "motor rubs beside gravity"],
 )
 def test_side_that_determines_stiffness_better_is_chosen(made: Callable[[], joints.Joint]):

@@ -64,7 +64,9 @@ def test_zeros_that_differ_between_logs_are_found_where_nothing_else_is_missing(
     assert unknown.zero == 0.0 and unknown.has_own_zero
 
 
-@pytest.mark.parametrize(("offsets", "friction"), [((1e-4, 1e-4), 0.0), ((5e-5, 2e-4), 0.03)])
+@pytest.mark.parametrize(
+    ("offsets", "friction"), [((1e-4, 1e-4), 0.0), pytest.param((5e-5, 2e-4), 0.03, marks=pytest.mark.slow)]
+)
 def test_zeros_are_left_where_they_are_equal_or_an_effect_is_missing(offsets: tuple[float, float], friction: float):
     logs = [experiment(i, zero=0.0, left=one, motor_friction=(friction, 0.05)) for i, one in enumerate(offsets)]
     assert zeros_apart(fitted(*logs)) == {}

@@ -34,7 +34,9 @@ def held_fit(model: Model, stretches: tuple[Stretch, ...]) -> Fit:
     return fit(model, stretches, base_paths(model), Segmentation(256), strategy=strategy)
 
 
-@pytest.mark.parametrize("measured", [TORQUE_SENSOR, ("motor_turn", "dynamic_error")])
+@pytest.mark.parametrize(
+    "measured", [TORQUE_SENSOR, pytest.param(("motor_turn", "dynamic_error"), marks=pytest.mark.slow)]
+)
 def test_first_order_strengths_of_small_mesh_terms_are_the_true_ones(measured: tuple[str, ...]):
     """A sensor of the joint torque measures the torque of a term in the mesh directly as well."""
     model = replace(rig.drive_model(), measured=measured)

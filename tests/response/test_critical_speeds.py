@@ -85,6 +85,7 @@ def test_branch_with_folds_gives_one_speed_band():
     assert can_persist(branch()).all()
 
 
+@pytest.mark.slow
 def test_response_of_a_linear_drive_is_one_branch_from_both_ends():
     """The continuation stops within a tolerance of the range's end."""
     model = TwoInertiaModel(DRIVE, (KinematicError(cos_1=2e-5, cos_2=1e-4),))

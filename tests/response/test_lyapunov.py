@@ -62,6 +62,7 @@ def test_saddles_are_equilibria_at_the_critical_energy():
         assert np.isposinf([saddle(oscillator(alpha)), critical_energy(oscillator(alpha))]).all()
 
 
+@pytest.mark.slow
 def test_all_motions_from_the_basin_estimate_come_to_rest():
     drive = oscillator(-1.0)
     x, v = jnp.meshgrid(jnp.linspace(-1.4, 1.4, 15), jnp.linspace(-2.1, 2.1, 15), indexing="ij")

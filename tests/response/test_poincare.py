@@ -52,6 +52,7 @@ def test_section_amplitudes_of_a_linear_drive_agree_with_the_closed_form():
     assert float(section.fundamental[0]) == pytest.approx(abs(phasors[0]), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_hysteresis_settles_onto_the_orbit_found_by_shooting():
     model = duffing(0.1, 0.0).with_effects(BoucWen(k=0.5, memory_twist=0.05))
     forcing = harmonic_series(0.7, 0.5)

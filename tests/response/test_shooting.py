@@ -182,6 +182,7 @@ def lane(alpha: Array, omega: Array, start: Array) -> PeriodicOrbit:
     return shoot(duffing().replace({"alpha": alpha}), harmonic_series(omega, 0.1).padded(2), start)
 
 
+@pytest.mark.slow
 def test_orbits_in_lanes_equal_a_loop_and_failures_are_marked():
     """Compiled and in lanes against one by one."""
     orbits = eqx.filter_jit(eqx.filter_vmap(lane))(ALPHAS, OMEGAS, STARTS)

@@ -23,7 +23,7 @@ POINTS = Points({"K": np.linspace(6e3, 8e3, 3), "forcing.phase": np.linspace(0.0
 HARMONIC = Harmonic(2.0, 385.0, 0.3, 0.1)
 # Actuator effects change a logged torque, which a sweep's forcing is not; thermal effects need a temperature.
 FORMS = [f for f in CATALOGUE if not issubclass(f, ActuatorEffect) and f.proposals(SCALES)]
-FEW = ("motor_friction", "quadratic_damping", "bouc_wen", "kinematic_harmonic", "load_disturbance")
+FEW = ("motor_friction", "bouc_wen", "load_disturbance")
 
 # Where the torque's slope jumps, steps lose their order.
 SHARP = ("three_slope_stiffness", "load_dependent_friction", "backlash", "undamped_backlash")

@@ -119,7 +119,7 @@ def requested(tolerance: float, outputs=("final",)) -> Request:
     ("case", "tolerance", "method"),
     [
         pytest.param(drive_case(alpha=0.1), 1e-3, "strang", marks=pytest.mark.slow),
-        (drive_case(), 1e-6, "aba864"),
+        pytest.param(drive_case(), 1e-6, "aba864", marks=pytest.mark.slow),
         pytest.param(drive_case(alpha=2e5), 1e-6, "srkn14", marks=pytest.mark.slow),
         (drive_case(BY_NAME["quadratic_damping"](c2=0.1)), 1e-6, "tsit5"),
     ],

@@ -81,6 +81,7 @@ def test_fixed_frequency_that_is_not_positive_is_refused(settings, omega):
         Case(case().model, Harmonic(0.3, omega)).require(request)
 
 
+@pytest.mark.slow
 def test_harmonic_phases_follow_the_phase_of_the_forcing():
     request = Request(Points({"forcing.phase": np.array([0.0, 0.7]), "forcing.omega": np.array([0.6, 1.9])}))
     request = Request(request.points, outputs=("harmonics",))

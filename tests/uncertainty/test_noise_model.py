@@ -152,6 +152,7 @@ def test_missing_effect_is_not_explained_as_noise(missing: dict[str, Any]):
     assert not is_noise(noise_model_of(fitted(noisy_experiment(correlation=0.95, std=0.0, count=8000, **missing))))
 
 
+@pytest.mark.slow
 def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
     """A lag of no strength to speak of oscillates freely in each segment, with an amplitude and phase of its own."""
     experiment = noisy_experiment(correlation=0.85, std=0.0, count=8000)
@@ -166,6 +167,7 @@ def test_hidden_states_fitted_to_each_segment_do_not_explain_slow_noise():
     assert found.objective - more.objective > 0.05 and after.likelihood < before.likelihood
 
 
+@pytest.mark.slow
 def test_effect_against_noise_is_judged_alike_with_a_poor_noise_estimate():
     """What is missing may inflate and correlate the noise that is estimated beside the base model."""
     torque = rig.drive_torque(4000)

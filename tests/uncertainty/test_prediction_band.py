@@ -101,6 +101,7 @@ def test_band_of_a_slow_channel_equals_the_scatter_of_repeated_free_runs(fitted:
     assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 50, weight=weight), 50)
 
 
+@pytest.mark.slow
 def test_band_of_a_log_with_a_zero_of_its_own_equals_the_scatter_of_repeated_free_runs(
     fitted: tuple[Fit, Uncertainty], band: PredictionBand
 ):

@@ -7,8 +7,7 @@ from fitting.formatting import axis_label, pretty_unit
 from fitting.report.outputs import in_words
 from fitting.report.plots.axes import AFTER, BEFORE, INK, axis, figure, numbers
 from fitting.report.plots.plot import Figure, Plot
-
-_NORMAL_95 = 1.96
+from fitting.uncertainty.normal_law import NORMAL_95
 
 
 def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
@@ -62,7 +61,7 @@ def _told(found: Evidence) -> list[Figure]:
                 "y": numbers(told[asked]),
                 "error_y": {
                     "type": "data",
-                    "array": numbers(_NORMAL_95 * std[asked]),
+                    "array": numbers(NORMAL_95 * std[asked]),
                     "color": color,
                     "thickness": 1.2,
                 },

@@ -7,9 +7,9 @@ from fitting.discrepancy.dynamic_stiffness import LearnedResponse
 from fitting.formatting import axis_label, pretty_unit
 from fitting.report.plots.axes import AFTER, FAINT, axis, axis_scale, figure, line_trace, numbers
 from fitting.report.plots.plot import Figure, Plot
+from fitting.uncertainty.normal_law import NORMAL_95
 
 _BINS = 60
-_NORMAL_95 = 1.96
 
 
 def learned_plot(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Plot:
@@ -32,7 +32,7 @@ def response_plot(found: LearnedResponse, *, unit: str) -> Plot:
         found: the response.
         unit: of its stiffness.
     """
-    widest = np.exp(np.minimum(_NORMAL_95 * found.std, np.log(1e3)))
+    widest = np.exp(np.minimum(NORMAL_95 * found.std, np.log(1e3)))
     low, high = found.stiffness / widest, found.stiffness * widest
     traces = [
         _band(found.frequency, low, high),
@@ -57,7 +57,7 @@ def response_plot(found: LearnedResponse, *, unit: str) -> Plot:
 
 def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     name = curve.variables[0]
-    at, value, reach = curve.grid[0], curve.on_grid, _NORMAL_95 * curve.std_on_grid
+    at, value, reach = curve.grid[0], curve.on_grid, NORMAL_95 * curve.std_on_grid
     count, edges = np.histogram(curve.at[:, 0], _BINS, range=(float(at[0]), float(at[-1])))
     density = {
         "type": "bar",
