@@ -200,11 +200,11 @@ def carried(
 ) -> Float[np.ndarray, "segments samples states nodes"]:
     """Change of the state at each interval's end by forces at its nodes."""
     pushed = np.swapaxes(push, -1, -2)
-    first, second = (ends @ (pushed * by) for ends, by in carriers(followed))
+    first, second = (ends @ (pushed * by) for ends, by in _carriers(followed))
     return first + second
 
 
-def carriers(followed: Followed) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+def _carriers(followed: Followed) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Change of the state at an interval's end by the two ends of a linear force, and the weight of each node in them.
 
     The line has the same mean and first moment as the force at the nodes, which is equivalent for dynamics slower than

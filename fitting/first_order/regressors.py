@@ -15,7 +15,7 @@ from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial
 from fitting.estimation.machine_code import actuated
 from fitting.first_order.internal_states import Memory, memory_of, own_between, own_states
-from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
+from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, place_of
 from hdjax import Drive, Model, PiecewisePolynomial
 from hdjax.dynamics import JOINT_TORQUE
 from hdjax.effects import (
@@ -24,11 +24,12 @@ from hdjax.effects import (
     MeshGeometryEffect,
     MeshTorqueEffect,
     Motion,
+    MotorSideEffect,
     SensorEffect,
     ShaftEffect,
 )
 from hdjax.effects.learned import LearnedMotorTorque
-from hdjax.engine.pointwise import slopes_at_instants
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
 from hdjax.parameters import own_value
 
 
@@ -62,8 +63,6 @@ def regressors(
     if stacked.states:
         states = own_states(seen, stacked, len(proposals), before)
         memory = memory_of(seen, states)
-    if isinstance(stacked, ShaftEffect) and stacked.takes_inertia():
-        return _with_inertia(seen, stacked, states), memory
     if isinstance(stacked, ActuatorEffect):
         added = {INPUT: _inputs(seen, proposals)}
     elif isinstance(stacked, SensorEffect):
@@ -71,7 +70,9 @@ def regressors(
     else:
         # An effect's contribution does not depend on other effects.
         bare = replace(seen.model, effects=())
-        added = _by_strength(_added, stacked, bare, seen.between, own=own_between(states))
+        inertial = isinstance(stacked, ShaftEffect) and stacked.takes_inertia()
+        accelerations = _accelerations(seen) if inertial else None
+        added = _by_strength(_added, stacked, bare, seen.between, accelerations, own=own_between(states))
     added = {name: _finite(values) for name, values in added.items()}
     lands, sizes = [seen.carried[name] for name in added], list(added.values())
     forces = Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))
@@ -118,8 +119,11 @@ def _with(effect: Effect, strengths: Array) -> Effect:
     return eqx.tree_at(_strengths, effect, list(strengths))
 
 
-def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: Array) -> dict[str, Array]:
-    """The quantities that an effect adds at an instant, by name."""
+def _added(
+    strengths: Array, effect: Effect, bare: Model, motion: Motion, accelerations: Array | None, own: Array
+) -> dict[str, Array]:
+    """The quantities that an effect adds at an instant, by name. Inertia that it takes off a shaft adds the torque that
+    accelerates it."""
     effect = _with(effect, strengths)
     if isinstance(effect, MeshGeometryEffect):
         assert motion.theta_m is not None
@@ -127,6 +131,10 @@ def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: A
     place = place_of(effect)
     assert place is not None and isinstance(effect, MeshTorqueEffect | ShaftEffect)
     torques = {place.name: effect.torque(motion, bare.drive, own)}  # pyright: ignore[reportArgumentType]
+    if accelerations is not None:
+        assert isinstance(effect, ShaftEffect) and isinstance(bare.drive, Drive)
+        shaft = 0 if isinstance(effect, MotorSideEffect) else 1
+        torques[place.name] += effect.inertia_taken(bare.drive) * accelerations[shaft]
     if isinstance(effect, MeshTorqueEffect) and effect.reacts() and isinstance(bare.drive, Drive):
         torques[LearnedMotorTorque.name] = effect.reaction(motion, bare.drive)
     return torques
@@ -146,17 +154,11 @@ def _inputs(seen: Along, proposals: Sequence[Effect]) -> Float[np.ndarray, "segm
     return polynomial(np.stack(found, axis=2)[:, :, None], (PART * segments.width[..., None])[..., None])
 
 
-def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:
-    """Regressors of effects that change the inertia, and with it the influence of all forces."""
-    model, segments, followed = seen.model, seen.segments, seen.followed
-    inputs = inputs_at(model, segments, PART * segments.width[..., None])
-    rates = _by_strength(_rates, stacked, model, followed.between, inputs, own=own_between(states))
-    reading = _readings(seen, stacked, states)
-    # A rate of each state at each node is a part.
-    parts = [[ends * weight for weight in by] for ends, by in carriers(followed)]
-    lands = np.concatenate([first + second for first, second in zip(*parts, strict=True)], axis=-1)
-    sizes = rates.reshape(*rates.shape[:2], -1, rates.shape[-1])
-    return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
+def _accelerations(seen: Along) -> Float[np.ndarray, "segments samples nodes 2"]:
+    """Accelerations of motor and load at the nodes."""
+    inputs = inputs_at(seen.model, seen.segments, PART * seen.segments.width[..., None])
+    rates = at_instants(_rates, (seen.model, 0), (seen.followed.between, 3), (inputs, 3))
+    return rates[..., [seen.model.state_names.index(name) for name in ("omega_m", "omega_l")]]
 
 
 def _readings(
@@ -168,9 +170,8 @@ def _readings(
     return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], inputs, own=own)
 
 
-def _rates(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
-    whole, states = model.with_effects(_with(effect, strengths)), jnp.concatenate([state, own])
-    return whole.rates(states, inputs.torque, inputs.load_torque, inputs.conditions)[: state.size]
+def _rates(model: Model, state: Array, inputs: Inputs) -> Array:
+    return model.rates(state, inputs.torque, inputs.load_torque, inputs.conditions)
 
 
 def _outputs(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
