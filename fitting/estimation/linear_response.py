@@ -141,7 +141,8 @@ def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segment
     return Inputs(torque, jnp.asarray(on_load), conditions)
 
 
-def _rates(model: Model, state: Array, inputs: Inputs) -> Array:
+def state_rates(model: Model, state: Array, inputs: Inputs) -> Array:
+    """Rates of the state under inputs at an instant."""
     return model.rates(state, inputs.torque, inputs.load_torque, inputs.conditions)
 
 
@@ -153,7 +154,9 @@ def _between(
     y0, y1 = knots[:, :-1], knots[:, 1:]
 
     def rise_at(states: np.ndarray, late: np.ndarray) -> np.ndarray:
-        return width[..., None] * at_instants(_rates, (model, 0), (states, 2), (inputs_at(model, segments, late), 2))
+        return width[..., None] * at_instants(
+            state_rates, (model, 0), (states, 2), (inputs_at(model, segments, late), 2)
+        )
 
     r0, r1 = (r[:, :, None] for r in (rise_at(y0, np.zeros_like(width)), rise_at(y1, width)))
     y0, y1 = y0[:, :, None], y1[:, :, None]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import strength_paths
-from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial
+from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial, state_rates
 from fitting.estimation.machine_code import actuated
 from fitting.first_order.internal_states import Memory, memory_of, own_between, own_states
 from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, place_of
@@ -157,7 +157,7 @@ def _inputs(seen: Along, proposals: Sequence[Effect]) -> Float[np.ndarray, "segm
 def _accelerations(seen: Along) -> Float[np.ndarray, "segments samples nodes 2"]:
     """Accelerations of motor and load at the nodes."""
     inputs = inputs_at(seen.model, seen.segments, PART * seen.segments.width[..., None])
-    rates = at_instants(_rates, (seen.model, 0), (seen.followed.between, 3), (inputs, 3))
+    rates = at_instants(state_rates, (seen.model, 0), (seen.followed.between, 3), (inputs, 3))
     return rates[..., [seen.model.state_names.index(name) for name in ("omega_m", "omega_l")]]
 
 
@@ -168,10 +168,6 @@ def _readings(
     own = np.moveaxis(states[:, :-1], 2, 0)
     inputs = inputs_at(seen.model, seen.segments, np.zeros_like(seen.segments.width))
     return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], inputs, own=own)
-
-
-def _rates(model: Model, state: Array, inputs: Inputs) -> Array:
-    return model.rates(state, inputs.torque, inputs.load_torque, inputs.conditions)
 
 
 def _outputs(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
