@@ -77,7 +77,7 @@ class Strategy:
     retry_states: bool = True
     give_up_above: float = np.inf
 
-    def solve(self, problem: Problem, begin: Unknowns, damping: float) -> Solution:
+    def solve(self, problem: Problem, begin: Unknowns, damping: float | Float[np.ndarray, " segments"]) -> Solution:
         """One pass: least squares with fixed weights, by [`fitting.estimation.solve.solve`][]."""
         return solve(problem, begin, self.max_steps, damping, least_progress=self.least_progress)
 
@@ -239,7 +239,7 @@ def _fit_aligned(
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
         problem = weighed(problem, covariance, shown)
-        solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
+        solution = strategy.solve(problem, unknowns, FIRST_DAMPING if solution is None else solution.damping)
         if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
             solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
         unknowns, covariance = solution.unknowns, solution.left_over.covariance
@@ -294,7 +294,7 @@ def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution
         again = strategy.solve(problem, grown, NEARBY_DAMPING)
         found = min(found, again, key=lambda s: np.sum(s.left_over.squares))
     mended = _retry_states(problem, found, strategy.least_progress) if strategy.retry_states else None
-    return found if mended is None else strategy.solve(problem, mended, NEARBY_DAMPING)
+    return found if mended is None else strategy.solve(problem, mended, found.damping)
 
 
 def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:

@@ -24,9 +24,10 @@ from hdjax.compilation import library_of, on_host
 KEPT, WELL = 0.01, 0.75
 """Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
 keeps more is followed by a bolder one."""
-LONGER, SHORTER = 30.0, 0.1
+LONGER, SHORTER, CAUTIOUS = 30.0, 0.1, 3.0
 """Factors of a step's size then. Damping that is small on the diagonal may be large across it, so it must go quickly
-where the model predicts well."""
+where the model predicts well; after a step that was not taken, by 3, then by 9 and 27. Otherwise two of three steps at
+corners of a nonsmooth model would not be taken."""
 SLIGHT = 1e-4
 """Relative change of the sum of squares that is none."""
 LEAST_DAMPING = 1e-12
@@ -258,6 +259,7 @@ class Iteration(Record):
         promised: by how much the next step is to lower half the sum of squares, negative.
         expected: sum of squares of the residual after the next step, to first order.
         size: inverse of the damping in units of the first one.
+        bolder: factor of the size after the next step that keeps what it promises.
         yardstick: the largest diagonal of J^T J so far, of the shared parameters.
         count: how many steps were taken.
         accepted: whether the point that was seen last is the best.
@@ -271,6 +273,7 @@ class Iteration(Record):
     promised: Float[Array | np.ndarray | np.float64, ""]
     expected: Float[Array | np.ndarray | np.float64, ""]
     size: Float[Array | np.ndarray | np.float64, ""]
+    bolder: Float[Array | np.ndarray | np.float64, ""]
     yardstick: Float[Array | np.ndarray, " parameters"]
     count: Int[Array | np.ndarray | np.int64, ""]
     accepted: Bool[Array | np.ndarray | np.bool_, ""]
@@ -327,6 +330,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             promised=np.array(-np.inf),
             expected=zero,
             size=np.ones(()),
+            bolder=np.array(LONGER),
             yardstick=np.zeros(y.parameters.shape),
             count=np.zeros((), int),
             accepted=np.zeros((), bool),
@@ -343,7 +347,8 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         slight = library.abs(cost - before) < SLIGHT * before
         closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * library.maximum(state.rows, state.expected))
         accepted = kept | slight | closing
-        size = state.size * where(kept, where(well, LONGER, 1.0), where(accepted, 1.0, SHORTER))
+        size = state.size * where(kept, where(well, state.bolder, 1.0), where(accepted, 1.0, SHORTER))
+        bolder = where(well, library.minimum(CAUTIOUS * state.bolder, LONGER), state.bolder)
         costs = library.concatenate([cost[None], state.costs[:-1]])
         new, old = (state.ahead, seen, costs, rows, gap), (y, state.found, state.costs, state.rows, state.gap)
         best, found, costs, rows, gap = jax.tree.map(lambda a, b: where(accepted, a, b), new, old)
@@ -351,7 +356,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
         # most that it has ever shown (Moré 1978).
         system = normal_equations(found, self.joined, state.yardstick)
-        step = system.step(library.maximum(self.damping / size, LEAST_DAMPING), self.longest)
+        step = system.step(self.damping_at(size), self.longest)
         promised, expected = self._promised(found, step)
         # Where the system has no solution to working precision, another step from here is more damped.
         solved = library.isfinite(promised)
@@ -364,11 +369,16 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             promised=where(solved, promised, -jnp.inf),
             expected=where(solved, expected, 0.0),
             size=where(solved, size, SHORTER * size),
+            bolder=where(accepted & solved, bolder, CAUTIOUS),
             yardstick=system.yardstick,
             count=state.count + 1,
             accepted=accepted,
         )
         return best, after, found
+
+    def damping_at(self, size: Any) -> Any:
+        """Damping of a step of this size."""
+        return library_of(size).maximum(self.damping / size, LEAST_DAMPING)
 
     def _promised(self, found: Products, step: Unknowns) -> tuple[Any, Any]:
         """By how much half the sum of squares changes along a step, to second order; and the residual's after it."""

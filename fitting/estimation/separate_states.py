@@ -1,11 +1,13 @@
 """Levenberg-Marquardt for initial states alone: segments that share nothing are problems of their own."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.levenberg_marquardt import (
+    CAUTIOUS,
     KEPT,
     LATEST,
     LEAST_DAMPING,
@@ -21,9 +23,33 @@ Look = Callable[[Unknowns], tuple[Products, Array | np.ndarray]]
 """The normal equations at some unknowns, and the rows of the residual."""
 
 
+class Ended(NamedTuple):
+    """Where an iteration ended.
+
+    Attributes:
+        unknowns: the best ones.
+        rows: of their residual.
+        success: whether the next step promised next to nothing.
+        steps: how many were taken.
+        damping: of the next step, of each segment where these are problems of their own.
+    """
+
+    unknowns: Unknowns
+    rows: Float[Array | np.ndarray, "segments rows"]
+    success: bool
+    steps: int
+    damping: float | Float[np.ndarray, " segments"]
+
+
 def solve_states(
-    look: Look, start: Unknowns, max_steps: int, damping: float, *, rtol: float, least_progress: float
-) -> tuple[Unknowns, Float[np.ndarray, "segments rows"], bool, int]:
+    look: Look,
+    start: Unknowns,
+    max_steps: int,
+    damping: float | Float[np.ndarray, " segments"],
+    *,
+    rtol: float,
+    least_progress: float,
+) -> Ended:
     """Fit the initial state of each segment with fixed parameters.
 
     Every segment has a damping of its own and takes or rejects its own steps. One damping for all would let a few
@@ -37,11 +63,9 @@ def solve_states(
         rtol: a segment is done where its next step promises less than this share of what one more degree of freedom
             explains of noise.
         least_progress: share of the sum of squares that a few steps must take off it.
-
-    Returns:
-        The unknowns, the rows of their residual, whether all segments are done, and the number of steps.
     """
     states, dampings = np.array(start.states), np.full(len(start.states), damping)
+    bolder = np.full(len(states), LONGER)
     seen, rows = look(start)
     products, rows = np.array(seen.products), np.array(rows)
     costs, done, steps = [np.inf] * LATEST, np.zeros(len(states), bool), 0
@@ -58,10 +82,11 @@ def solve_states(
         changed = 0.5 * (seen.products[:, -1, -1] - squares)
         taken = (changed <= KEPT * promised) | (np.abs(changed) < 0.5 * SLIGHT * squares)
         well = changed < WELL * promised
-        dampings = dampings / np.where(taken, np.where(well, LONGER, 1.0), SHORTER)
+        dampings = dampings / np.where(taken, np.where(well, bolder, 1.0), SHORTER)
+        bolder = np.where(taken, np.where(well, np.minimum(CAUTIOUS * bolder, LONGER), bolder), CAUTIOUS)
         dampings = np.maximum(dampings, LEAST_DAMPING)
         states[taken], products[taken], rows[taken] = ahead[taken], seen.products[taken], np.asarray(rows_ahead)[taken]
-    return Unknowns(start.parameters, states), rows, bool(done.all()), steps
+    return Ended(Unknowns(start.parameters, states), rows, bool(done.all()), steps, dampings)
 
 
 def _step(

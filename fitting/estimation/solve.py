@@ -13,13 +13,12 @@ from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.machine_code import task
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
-from fitting.estimation.separate_states import Look, solve_states
+from fitting.estimation.separate_states import Ended, Look, solve_states
 from hdjax.compilation import jit_small, on_host
 from hdjax.lanes import on_one_device, placed_like
 
 FIRST_DAMPING, NEARBY_DAMPING = 1e-3, 1e-9
-"""Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other
-weights."""
+"""Damping of the first step, relative to the diagonal of J^T J: from a start, and near a solution."""
 
 # A step that would carry a positive parameter farther (a factor e) was promised by a slope that does not reach so far:
 # a corner that leaps to zero shows no slope there, and never comes back.
@@ -48,16 +47,23 @@ class Solution(eqx.Module):
         left_over: by the model there.
         success: whether the next step promised next to nothing.
         steps: how many were taken.
+        damping: with which an iteration under slightly other weights goes on.
     """
 
     unknowns: Unknowns
     left_over: LeftOver
     success: bool = eqx.field(static=True)
     steps: int = eqx.field(static=True)
+    damping: float | Float[np.ndarray, " segments"]
 
 
 def solve(
-    problem: Problem, start: Unknowns, max_steps: int, damping: float, *, least_progress: float = 0.0
+    problem: Problem,
+    start: Unknowns,
+    max_steps: int,
+    damping: float | Float[np.ndarray, " segments"],
+    *,
+    least_progress: float = 0.0,
 ) -> Solution:
     """Iterate to the least squares.
 
@@ -75,18 +81,23 @@ def solve(
         if separate:
             rtol = ArrowLevenbergMarquardt.rtol
             limits = {"rtol": rtol, "least_progress": least_progress}
-            best, found, success, steps = solve_states(look, begin, max_steps, damping, **limits)
+            ended = solve_states(look, begin, max_steps, damping, **limits)
         else:
-            best, found, success, steps = _solve_together(problem, look, begin, max_steps, damping, least_progress)
+            ended = _solve_together(problem, look, begin, max_steps, damping, least_progress)
+    best = ended.unknowns
     unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
-    return Solution(unknowns, _left_over(problem, found), success, steps)
+    return Solution(unknowns, _left_over(problem, ended.rows), ended.success, ended.steps, ended.damping)
 
 
 def _solve_together(
-    problem: Problem, look: Look, best: Unknowns, max_steps: int, damping: float, least_progress: float
-) -> tuple[Unknowns, Array | np.ndarray, bool, int]:
-    """The iteration where segments share parameters or are joined: the unknowns, the rows of their residual, whether it
-    met its tolerance, and the number of steps."""
+    problem: Problem,
+    look: Look,
+    best: Unknowns,
+    max_steps: int,
+    damping: float | Float[np.ndarray, " segments"],
+    least_progress: float,
+) -> Ended:
+    """The iteration where segments share parameters or are joined."""
     segments = problem.segments
     solver = ArrowLevenbergMarquardt(
         joined=np.asarray(segments.joined),
@@ -106,7 +117,7 @@ def _solve_together(
         done, late = solver.ended(best, state)
         finite = np.all(np.isfinite(best.parameters)) and np.all(np.isfinite(best.states))
         if done or late or not finite:
-            return best, found, bool(done and finite), int(state.count)
+            return Ended(best, found, bool(done and finite), int(state.count), float(solver.damping_at(state.size)))
         seen, rows = look(state.ahead)
 
 

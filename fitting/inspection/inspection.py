@@ -360,5 +360,5 @@ def _signal(
         doubts = (f"its unit may be {unit.unit} or {rivals}", *doubts)
         return replace(guess, unit=None, size=unit.size, doubts=doubts)
     if unit.confidence < _SURE_UNIT:
-        doubts = (f"{unit.unit} is assumed, {rivals} is possible", *doubts)
+        doubts = (f"{unit.unit} is assumed" + (f", {rivals} is possible" if rivals else ""), *doubts)
     return replace(guess, unit=unit.unit, size=unit.size, unit_reason=unit.reason, doubts=doubts)

@@ -14,7 +14,7 @@ from fitting.estimation.problem import initial_states, natural_frequency, on_all
 from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.segments import cut
-from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
+from fitting.estimation.solve import FIRST_DAMPING, solve
 from fitting.estimation.weighing import Shown, weighed
 
 # This many samples determine the noise to 2 %; a covariance that changes less between two passes has converged.
@@ -133,12 +133,11 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         part = with_engine(replace(held, segments=replace(segments, weight=jnp.asarray(head))))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         part, unknowns = on_all_devices(part, unknowns)
-        covariance, before = found.covariance, np.full(len(found.covariance), np.inf)
-        for turn in range(REWEIGHTINGS):
+        covariance, before, damping = found.covariance, np.full(len(found.covariance), np.inf), FIRST_DAMPING
+        for _ in range(REWEIGHTINGS):
             part = weighed(part, covariance, shown)
-            damping = NEARBY_DAMPING if turn else FIRST_DAMPING
             solution = solve(part, unknowns, _STEPS, damping, least_progress=_LEAST_PROGRESS)
-            unknowns, covariance = solution.unknowns, solution.left_over.covariance
+            unknowns, covariance, damping = solution.unknowns, solution.left_over.covariance, solution.damping
             now = np.sqrt(np.diag(covariance))
             if np.all(np.abs(now - before) <= _SETTLED * now):
                 break

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from fitting.estimation.residual import Products, Unknowns
-from fitting.estimation.separate_states import solve_states
+from fitting.estimation.separate_states import Ended, solve_states
 
 PARAMETERS = 2
 STARTS = np.array([[-1.2, 1.0], [0.9, 0.9], [2.0, -3.0], [0.1, 0.1]])
@@ -38,15 +38,15 @@ class Sight:
         return Products(products, np.zeros((len(rows), 2)), nothing, np.zeros((len(rows), 2, 2))), rows
 
 
-def solved(look: Sight) -> tuple[Unknowns, np.ndarray, bool, int]:
+def solved(look: Sight) -> Ended:
     with np.errstate(all="ignore"):
         return solve_states(look, Unknowns(np.zeros(PARAMETERS), STARTS), 200, 1e-3, rtol=1e-10, least_progress=0.0)
 
 
 def test_each_segment_reaches_its_own_minimum():
-    found, rows, success, _ = solved(Sight())
-    assert success
-    for start, state, row in zip(STARTS, np.asarray(found.states), rows, strict=True):
+    found = solved(Sight())
+    assert found.success
+    for start, state, row in zip(STARTS, np.asarray(found.unknowns.states), found.rows, strict=True):
         np.testing.assert_allclose(state, least_squares(rosenbrock, start, xtol=1e-12).x, atol=1e-4)
         np.testing.assert_allclose(row, rosenbrock(state), atol=1e-12)
 
@@ -62,16 +62,23 @@ def test_segments_do_not_hold_each_other_up():
 
 
 def test_diverging_segment_stays_and_the_others_converge():
-    found, rows, success, _ = solved(Sight(diverging=1))
-    assert success and np.isfinite(rows[:-1]).all()
-    np.testing.assert_array_equal(np.asarray(found.states)[-1], STARTS[-1])
-    np.testing.assert_allclose(np.asarray(found.states)[:-1], np.asarray(solved(Sight())[0].states)[:-1], atol=1e-6)
+    found, whole = solved(Sight(diverging=1)), solved(Sight())
+    assert found.success and np.isfinite(found.rows[:-1]).all()
+    np.testing.assert_array_equal(found.unknowns.states[-1], STARTS[-1])
+    np.testing.assert_allclose(found.unknowns.states[:-1], whole.unknowns.states[:-1], atol=1e-6)
+
+
+def test_another_pass_goes_on_with_the_damping_of_the_first():
+    first = solved(Sight())
+    look = Sight()
+    with np.errstate(all="ignore"):
+        again = solve_states(look, first.unknowns, 200, first.damping, rtol=1e-10, least_progress=0.0)
+    assert again.success and again.steps <= 2
+    assert first.damping.shape == (len(STARTS),) and np.all(first.damping < 1e-3)
 
 
 @pytest.mark.parametrize("most", [1, 3])
 def test_iteration_ends_at_the_latest_after_so_many_steps(most: int):
     look = Sight()
-    _, _, success, steps = solve_states(
-        look, Unknowns(np.zeros(PARAMETERS), STARTS), most, 1e-3, rtol=1e-10, least_progress=0.0
-    )
-    assert not success and steps == most
+    found = solve_states(look, Unknowns(np.zeros(PARAMETERS), STARTS), most, 1e-3, rtol=1e-10, least_progress=0.0)
+    assert not found.success and found.steps == most

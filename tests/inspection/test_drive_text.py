@@ -12,6 +12,7 @@ from joint_logs import SHAPES
 from simulated_joint import Motion, simulated
 
 import fitting
+from fitting.inspection import settling
 from fitting.logs.drive_file import read_drive_file
 
 FILLED = {"motor_inertia": "3e-4", "load_inertia": "1.2", "reduction_ratio": "100", "sample_rate": "1000"}
@@ -133,6 +134,18 @@ def test_counter_that_wraps_at_16_bits_does_not_tell_its_revolution(motion: Moti
     columns = {"t": motion.time, "motor_enc": counts, "load_angle": motion.load_angle, "tau": motion.motor_torque}
     found = fitting.inspect(columns)
     assert found.inspection.joint.signals["motor_angle"].unit in (None, "rev / 4096")
+
+
+def test_assumed_unit_is_told_with_its_rivals_if_there_are_any(motion: Motion, monkeypatch: pytest.MonkeyPatch):
+    counts = np.rint(motion.motor_angle * 16384 / (2 * np.pi))
+    columns = {"t": motion.time, "motor_enc": counts, "load_angle": motion.load_angle, "tau": motion.motor_torque}
+
+    def doubts() -> tuple[str, ...]:
+        return fitting.inspect(columns).inspection.joint.signals["motor_angle"].doubts
+
+    assert doubts() == ("rev / 16384 is assumed, rev / 8192 or rev / 65536 or rev / 4096 is possible",)
+    monkeypatch.setattr(settling, "_NOTED", 1.0)
+    assert doubts() == ("rev / 16384 is assumed",)
 
 
 def test_stamps_in_two_columns_are_written_and_read(motion: Motion, tmp_path: Path):
