@@ -20,7 +20,7 @@ from typing import Any, Literal
 import jax
 import polars as pl
 
-from fitting.threads import one_blas_thread
+from fitting.blas import one_blas_thread
 from fitting.drive_data import Rig, read_rig
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole

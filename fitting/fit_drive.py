@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from fitting.threads import one_blas_thread
+from fitting.blas import one_blas_thread
 from fitting.clock import Clock
 from fitting.estimation.base_fit import BaseFit, base_fit, is_held
 from fitting.estimation.estimate import Fit

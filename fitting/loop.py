@@ -15,7 +15,7 @@ from fitting.attribution.log_alignment import clock_shifts, with_clock_shifts, w
 from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
-from fitting.threads import one_blas_thread
+from fitting.blas import one_blas_thread
 from fitting.clock import Clock
 from fitting.conclusion import Conclusion, draw_conclusion
 from fitting.discrepancy.challenge import Challenge, challenge_names

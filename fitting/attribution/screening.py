@@ -7,7 +7,7 @@ also on held-out data. Applied to surrogates of the residual, it gives the null 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Generic, NamedTuple
+from typing import Generic
 
 import equinox as eqx
 import numpy as np
@@ -19,7 +19,6 @@ from fitting.estimation.free_parameters import MESH, strength_paths
 from fitting.estimation.scales import scales
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import (
-    FittedMotion,
     along_measured_motion,
     fitted_motion,
     follow_on,
@@ -27,7 +26,6 @@ from fitting.first_order.linearised_fit import (
 )
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
-from fitting.threads import each
 from fitting.uncertainty.one_side import contradicts
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, ActuatorEffect, Effect, applicable
@@ -107,38 +105,26 @@ def screen(
     off, slope = _priors(training)
     free_mesh = np.where([path in MESH for path in training.free.paths], 0.0, slope)
 
-    goes_on = follow_on(training, held_out)
-
-    def look_at(form: _Form) -> tuple[Lead | None, np.ndarray]:
-        """The best of a form's proposals, and its null gains."""
-        best, chance = None, np.full(DRAWS * PARTNERS, -np.inf)
-        found = responses(form.motions, form.proposals, goes_on)
-        for effect, own, states in zip(found.proposals, found.columns, found.own_states, strict=True):
-            used = [*range(known), *(skipped + known + c for c in own)]
-            fitted, unseen = (scores.columns(used) for scores in found.scores)
-            if known:
-                fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
-            if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
-                # Its response diverges along this motion: nothing is known to first order.
-                continue
-            paths, info = strength_paths(effect), model.with_effects(effect).parameters()
-            positive = [known + i for i, p in enumerate(paths) if info[p][1].positive]
-            step, gain = _linear_gain(fitted, unseen, known, positive)
-            chance = np.maximum(chance, null_gains(fitted, unseen, known))
-            if best is not None and best.gain >= gain:
-                continue
-            strengths = {p: float(info[p][0]) + step[known + i] for i, p in enumerate(paths)}
-            filled = model.with_effects(effect).replace(strengths).effect(effect.name)
-            changes = {p: step[i] for i, p in enumerate(free_now)}
-            best = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
-        return best, chance
-
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
-    for lead, of_form in each(look_at, _forms(training, held_out, proposals, seed, strays=strays)):
-        chance = np.maximum(chance, of_form)
-        if lead is not None and (lead.effect.name not in leads or lead.gain > leads[lead.effect.name].gain):
-            leads[lead.effect.name] = lead
+    for effect, own, states, scores in _responses(training, held_out, proposals, seed, strays=strays):
+        used = [*range(known), *(skipped + known + c for c in own)]
+        fitted, unseen = (each.columns(used) for each in scores)
+        if known:
+            fitted = fitted.beside_prior(off, free_mesh if contradicts(effect, side) else slope)
+        if not (np.isfinite(fitted.gram).all() and np.isfinite(unseen.gram).all()):
+            # Its response diverges along this motion: nothing is known to first order.
+            continue
+        paths, info = strength_paths(effect), model.with_effects(effect).parameters()
+        positive = [known + i for i, p in enumerate(paths) if info[p][1].positive]
+        step, gain = _linear_gain(fitted, unseen, known, positive)
+        chance = np.maximum(chance, null_gains(fitted, unseen, known))
+        if effect.name in leads and leads[effect.name].gain >= gain:
+            continue
+        strengths = {p: float(info[p][0]) + step[known + i] for i, p in enumerate(paths)}
+        filled = model.with_effects(effect).replace(strengths).effect(effect.name)
+        changes = {p: step[i] for i, p in enumerate(free_now)}
+        leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
 
@@ -151,30 +137,27 @@ def _priors(fit: Fit) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, " f
     return np.asarray(free.off_prior(free.pack(fit.model))), slope
 
 
-class _Form(NamedTuple):
-    """Proposals of one form, and the training and held-out motions along which they are evaluated."""
-
-    motions: tuple[FittedMotion, FittedMotion]
-    proposals: list[Effect]
-
-
-def _forms(
+def _responses(
     training: Fit, held_out: Fit, proposals: Sequence[Effect], seed: int, *, strays: bool
-) -> Iterator[_Form]:
-    """The proposals by form.
+) -> Iterator[tuple[Effect, list[int], np.ndarray | None, tuple[Scores, Scores]]]:
+    """Each proposal, its columns, its hidden states at the start of each training segment, and the scores of its form
+    along training and held-out data.
 
     Where the model's motion strays from the log, effects are evaluated along the measured motion too. The true one is
     between the two: an encoder reads a kinematic error as a twist that the spring does not have.
     """
     first, second = fitted_motion(training, seed), fitted_motion(held_out, seed + 1)
-    passes: list[tuple[tuple[FittedMotion, FittedMotion], Sequence[Effect]]] = [((first, second), proposals)]
+    passes = [((first, second), proposals)]
     if strays:
         measured = along_measured_motion(first, training), along_measured_motion(second, held_out)
         # Effects on the torque signal do not depend on the motion.
         passes.append((measured, [p for p in proposals if not isinstance(p, ActuatorEffect)]))
+    goes_on = follow_on(training, held_out)
     for motions, tried in passes:
         for form in dict.fromkeys(type(p) for p in tried):
-            yield _Form(motions, [p for p in tried if type(p) is form])
+            found = responses(motions, [p for p in tried if type(p) is form], goes_on)
+            for effect, columns, states in zip(found.proposals, found.columns, found.own_states, strict=True):
+                yield effect, columns, states, found.scores
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:
