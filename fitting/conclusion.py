@@ -18,7 +18,7 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.one_side_check import better_side, held_by_side
-from fitting.uncertainty.identifiability import parameters_at_bounds
+from fitting.uncertainty.identifiability import outside_domain
 from fitting.uncertainty.measurement_noise import MeasurementNoise, excess
 from fitting.uncertainty.noise_model import NoiseModel
 from fitting.uncertainty.one_side import without_mesh_priors
@@ -86,7 +86,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     current = trusted if unknown is None else unknown.trial
     fitted, side = _fitted_to_the_end(current.training, seen, study)
     names = {e.name for e in trusted.model.effects}
-    seen = replace(seen, at_bounds=sum(len(parameters_at_bounds(fitted.model, name)) for name in names))
+    seen = replace(seen, at_bounds=sum(len(outside_domain(fitted, name)) for name in names))
     at_first = _along_selection(base.training, base.hold, study, covariance)
     runs = _along_selection(fitted, current.hold, study, covariance)
     outcome = claimed

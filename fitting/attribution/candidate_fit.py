@@ -244,18 +244,31 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
     short = before.held_out.objective - trial.held_out.objective
     if not effect.states or short <= 0.0:
         return 1.0
-    long = long_gains(before, [trial])
-    return 1.0 if long is None else float(np.clip(long[0] / short, 0.0, 1.0))
+    whole = _along_whole_stretches([before, trial])
+    if whole is None:
+        return 1.0
+    first, last = (fitted.objective for fitted in whole)
+    return float(np.clip((first - last) / short, 0.0, 1.0)) if np.isfinite(last) else 0.0
 
 
 def long_gains(before: Trial, trials: Sequence[Trial]) -> list[float] | None:
-    """Gains of trials over the preceding model along whole held-out stretches. None where no model follows the drive
-    for so long, or the preceding one diverges."""
-    whole = [trial.along_whole_stretches for trial in (before, *trials)]
-    first, *others = (fitted.objective for fitted in whole)
-    if not (np.isfinite(first) and any(follows(fitted) for fitted in whole)):
+    """Decreases of the principal output's log rms error along whole held-out stretches, from the preceding model to
+    trials. None where no model follows the drive for so long, or the preceding one diverges.
+
+    A motor angle is not among these outputs: nothing holds it, so that it drifts with the smallest error of a torque.
+    """
+    whole = _along_whole_stretches([before, *trials])
+    if whole is None:
         return None
-    return [float(first - objective) if np.isfinite(objective) else -np.inf for objective in others]
+    first, *others = (np.log(fitted.principal_std) for fitted in whole)
+    return [float(first - log) if np.isfinite(log) else -np.inf for log in others]
+
+
+def _along_whole_stretches(trials: Sequence[Trial]) -> list[Fit] | None:
+    """Trials along whole held-out stretches. None where none follows the drive for so long, or the first diverges."""
+    whole = [trial.along_whole_stretches for trial in trials]
+    usable = np.isfinite(whole[0].objective) and any(follows(fitted) for fitted in whole)
+    return whole if usable else None
 
 
 def halo_for(training: Sequence[Stretch]) -> int:

@@ -26,7 +26,7 @@ from fitting.attribution.support import (
 )
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.first_order.motion import place_of
-from fitting.uncertainty.identifiability import parameters_at_bounds
+from fitting.uncertainty.identifiability import outside_domain
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
@@ -94,17 +94,17 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
     assert trial is not None
     own = {verdict.name} & {e.name for e in trial.model.effects}
     errors = strength_errors(trial.training, own)
-    # A law that is replaced is not excused by its imperfection.
+    # A law that is replaced is not excused by its imperfection, nor are laws beside which only noise is left.
     kept = [e for e in standing.before.model.effects if e.name in {other.name for other in trial.model.effects}]
     return EffectEvidence(
         name=verdict.name,
         gain=verdict.gain,
         p_value=verdict.p_value,
         removed=share_of_removed(trial, standing.before, standing.base),
-        imperfection=imperfection(kept) if standing.excused else 0.0,
+        imperfection=imperfection(kept) if standing.excused and not leaves_white_noise(trial.training) else 0.0,
         strength_errors=min(errors.values(), default=np.inf),
         over_noise=standing.over_noise(trial),
-        at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
+        at_bounds=len(outside_domain(trial.training, verdict.name)),
     )
 
 

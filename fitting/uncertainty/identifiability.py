@@ -13,7 +13,7 @@ from fitting.estimation.scales import scales
 from fitting.formatting import Place, in_log_units, words
 from fitting.uncertainty.held_values import Held, held_values
 from fitting.uncertainty.sandwich import directions
-from fitting.uncertainty.standard_errors import Estimate, Uncertainty
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty, uncertainty
 from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 from hdjax.effects import ActuatorEffect
 from hdjax.parameters import ParameterInfo
@@ -308,3 +308,21 @@ def parameters_at_bounds(model: Model, name: str) -> list[str]:
     """
     known = {p: v for p, v in model.parameters().items() if p.startswith(f"{name}.")}
     return [p for p, (v, info) in known.items() if reached_bound(float(v), _in_units_of(model, info)) is not None]
+
+
+def outside_domain(fit: Fit, name: str) -> list[str]:
+    """The paths of an effect's parameters whose whole interval is at a bound of their domain, or beyond: its law does
+    not fit. A parameter that the data do not determine may end anywhere.
+
+    Args:
+        fit: of the model.
+        name: of the effect.
+    """
+    ended, known = parameters_at_bounds(fit.model, name), fit.model.parameters()
+    found = uncertainty(fit, torque_noise=False).estimates if ended else {}
+
+    def ends_outside(path: str) -> bool:
+        info = _in_units_of(fit.model, known[path][1])
+        return all(reached_bound(end, info) is not None for end in found[path].ci95)
+
+    return [path for path in ended if path not in found or ends_outside(path)]

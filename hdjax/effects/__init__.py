@@ -42,7 +42,7 @@ from hdjax.effects.position import (
     PositionDependentStiffness,
     RipplingMotorFriction,
 )
-from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMeshFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import (
     EncoderOffset,
@@ -98,6 +98,7 @@ __all__ = [
     "LoadSideEffect",
     "LoggedTorqueLag",
     "LuGreLoadFriction",
+    "LuGreMeshFriction",
     "LuGreMotorFriction",
     "MaxwellSlip",
     "MeshGeometryEffect",

@@ -29,7 +29,7 @@ from hdjax.effects.position import (
     PositionDependentStiffness,
     RipplingMotorFriction,
 )
-from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMeshFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import (
     EncoderOffset,
@@ -54,6 +54,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     DisplacementDamping,
     CoulombFriction,
     LoadDependentFriction,
+    LuGreMeshFriction,
     MotorFriction,
     ViscousMotorFriction,
     StribeckMotorFriction,

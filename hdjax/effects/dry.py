@@ -31,7 +31,7 @@ class DryFriction(Effect):
     """
 
     opposes: ClassVar[str]
-    # The reversal of the sign near rest is not specified: a hyperbolic tangent is one of many laws.
+    # What happens near rest is not specified: a hyperbolic tangent and bristles are two of many laws.
     imperfection: ClassVar[float] = 1e-2
 
     @property

@@ -1,4 +1,4 @@
-"""Friction of a shaft with memory: bristles that bend before they slide."""
+"""Friction with memory: bristles that bend before they slide."""
 
 import abc
 from typing import ClassVar
@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.bristle import SETTLING, SETTLING_SHARE, bristle_rate
-from hdjax.effects.dry import load_rate, motor_rate
-from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
+from hdjax.effects.dry import DryFriction, load_rate, motor_rate
+from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
 from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
@@ -34,6 +34,7 @@ class DahlMotorFriction(MotorSideEffect):
     name: ClassVar[str] = "dahl_motor_friction"
     contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
     states: ClassVar[tuple[str, ...]] = ("z",)
+    imperfection: ClassVar[float] = DryFriction.imperfection
 
     T_c: Scalar = parameter(
         0.0, unit="N m", doc="Coulomb torque at the motor", source="Dahl", bounds=(0.0, 1e3), role="strength"
@@ -65,7 +66,7 @@ class DahlMotorFriction(MotorSideEffect):
 
 
 class _LuGre(Effect):
-    """LuGre friction `sigma_0 z + sigma_1 z' + b omega` against a shaft (Canudas de Wit et al. 1995), where
+    """LuGre friction `sigma_0 z + sigma_1 z'` against a rate omega (Canudas de Wit et al. 1995), where
     `z' = omega - sigma_0 |omega| z / g`.
 
     `g = T_c (1 + excess exp(-(omega / omega_s)^2))`, `sigma_0 = T_c / bend` and `sigma_1 = sigma_0 tau`, so that the
@@ -73,11 +74,11 @@ class _LuGre(Effect):
     """
 
     states: ClassVar[tuple[str, ...]] = ("z",)
+    imperfection: ClassVar[float] = DryFriction.imperfection
 
     T_c: Scalar = parameter(
-        0.0, unit="N m", doc="Coulomb torque at the shaft", source=SOURCE, bounds=(0.0, 1e4), role="strength"
+        0.0, unit="N m", doc="Coulomb torque against the rate", source=SOURCE, bounds=(0.0, 1e4), role="strength"
     )
-    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source=SOURCE, role="strength")
     excess: Scalar = parameter(
         0.5,
         unit="1",
@@ -103,11 +104,11 @@ class _LuGre(Effect):
     @staticmethod
     @abc.abstractmethod
     def rate_of(motion: Motion) -> Array:
-        """The shaft's rate."""
+        """The rate that it opposes."""
 
     @classmethod
     def at_rates(cls, rate: float, ratio: float, scales: Scales) -> tuple[Effect, ...]:
-        """Proposals (starting values) for a shaft that turns at such rates [rad/s], `ratio` times the output's."""
+        """Proposals (starting values) at such rates [rad/s], `ratio` times the output's."""
         settling, bends = SETTLING_SHARE * scales.time_step, _bends(rate, scales)
         slow = (_SHARE_OF_RATE * rate, *(ratio * omega_s for omega_s in _AT_OUTPUT))
         shapes = [(omega_s, bend, _DAMPING) for omega_s in slow for bend in bends]
@@ -117,9 +118,10 @@ class _LuGre(Effect):
             for omega_s, bend, damping in shapes
         )
 
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+    def bristles(self, motion: Motion, state: Array) -> Array:
+        """The torque of the bristles [N m]."""
         (slipping,) = self.state_rates(motion, state)
-        return -self.T_c * (state[0] + self.tau * slipping) / self.bend - self.b * self.rate_of(motion)
+        return self.T_c * (state[0] + self.tau * slipping) / self.bend
 
     def _level(self, motion: Motion) -> Array:
         return 1.0 + self.excess * exponential(-((self.rate_of(motion) / self.omega_s) ** 2))
@@ -144,7 +146,38 @@ class _LuGre(Effect):
         }
 
 
-class LuGreMotorFriction(_LuGre, MotorSideEffect):
+class LuGreMeshFriction(_LuGre, MeshTorqueEffect):
+    """LuGre friction `sigma_0 z + sigma_1 z'` between the mesh's two sides, `z' = v - sigma_0 |v| z / g`.
+
+    `g = T_c (1 + excess exp(-(v / omega_s)^2))`, `sigma_0 = T_c / bend`, `sigma_1 = sigma_0 tau`. Viscous friction of
+    the mesh is B_sp.
+    """
+
+    family: ClassVar[str] = "coulomb_friction"
+    name: ClassVar[str] = "lugre_mesh_friction"
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return cls.at_rates(scales.v, 1.0, scales)
+
+    @staticmethod
+    def rate_of(motion: Motion) -> Array:
+        return motion.v
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return self.bristles(motion, state)
+
+
+class _LuGreOfShaft(_LuGre):
+    """LuGre friction `sigma_0 z + sigma_1 z' + b omega` against a shaft."""
+
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source=SOURCE, role="strength")
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.bristles(motion, state) - self.b * self.rate_of(motion)
+
+
+class LuGreMotorFriction(_LuGreOfShaft, MotorSideEffect):
     """LuGre friction `sigma_0 z + sigma_1 z' + b omega_m` against the motor, `z' = omega_m - sigma_0 |omega_m| z / g`.
 
     `g = T_c (1 + excess exp(-(omega_m / omega_s)^2))`, `sigma_0 = T_c / bend`, `sigma_1 = sigma_0 tau`.
@@ -163,7 +196,7 @@ class LuGreMotorFriction(_LuGre, MotorSideEffect):
         return motor_rate(motion)
 
 
-class LuGreLoadFriction(_LuGre, LoadSideEffect):
+class LuGreLoadFriction(_LuGreOfShaft, LoadSideEffect):
     """LuGre friction `sigma_0 z + sigma_1 z' + b omega_l` against the load, `z' = omega_l - sigma_0 |omega_l| z / g`.
 
     `g = T_c (1 + excess exp(-(omega_l / omega_s)^2))`, `sigma_0 = T_c / bend`, `sigma_1 = sigma_0 tau`.

@@ -14,7 +14,7 @@ from hdjax import Drive
 from hdjax.effects import Effect, Motion, Scales
 from hdjax.effects.bristle import bristle_rate, slip_rate
 from hdjax.effects.hysteresis import Dahl, MaxwellSlip
-from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMeshFriction, LuGreMotorFriction
 
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0)
 NO_LIMIT = 1e-12  # s: a settling time that does not bound the bristles' rate
@@ -196,6 +196,19 @@ def test_lugre_friction_at_constant_speed_is_the_stribeck_curve(form, omega):
     derived = {name: float(v) for name, (v, _) in effect.derived(DRIVE).items()}
     assert derived == pytest.approx({"sigma_0": 200.0, "sigma_1": 4.0, "T_s": 0.3})
     # The initial state of a turning shaft is its steady state.
+    assert float(effect.initial_state(motion)[0]) == pytest.approx(bent, rel=1e-6)
+
+
+@pytest.mark.parametrize("v", (-0.3, 0.02))
+def test_lugre_friction_of_the_mesh_at_constant_rate_is_a_stribeck_curve(v: float):
+    """A torque with the twist's rate, as that of the spring with the twist; viscous friction of the mesh is B_sp."""
+    effect = LuGreMeshFriction(T_c=0.2, excess=0.5, omega_s=0.05, bend=1e-5, tau=0.002, settling=1e-5)
+    rate = np.full((400, 3), v)
+    step = 0.3 * np.hypot(1e-5 / v, 1e-5)
+    (bent,) = np.asarray(states_along(effect, jnp.zeros(401), jnp.asarray(rate), jnp.asarray(step)))[-1]
+    motion = Motion(x=jnp.zeros(()), v=jnp.asarray(v))
+    torque = float(effect.torque(motion, DRIVE, jnp.asarray([bent])))
+    assert torque == pytest.approx((0.2 + 0.1 * np.exp(-((v / 0.05) ** 2))) * np.sign(v), rel=1e-6)
     assert float(effect.initial_state(motion)[0]) == pytest.approx(bent, rel=1e-6)
 
 
