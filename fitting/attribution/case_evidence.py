@@ -28,7 +28,7 @@ class EffectEvidence:
         imperfection: error that the laws of preceding effects may cause, likewise.
         strength_errors: standard errors by which its most significant strength differs from zero.
         over_noise: log likelihood ratio against noise; infinite where noise does not explain the residual.
-        at_bounds: number of its parameters that ended at a bound.
+        at_bounds: number of its parameters that the data put at a bound.
     """
 
     name: str
@@ -179,7 +179,7 @@ class FinalEvidence:
             that is not checked, or the band says nothing.
         free_runs_explained: share of the free runs' error beyond noise that the effects remove; None where that is not
             checked, or all runs diverge.
-        at_bounds: parameters of the named effects that ended at a bound in the final fit.
+        at_bounds: parameters of the named effects that the data put at a bound in the final fit.
         wide_bands: whether prediction bands say nothing: they are wider than the measured motion.
         replaced: whether a learned term replaced the names since these do not explain free runs; the rest is still
             evidence for the names.

@@ -45,7 +45,7 @@ class DecisionRules:
     at_bounds: float = _rule(
         0.0,
         "parameters",
-        "largest number of an effect's parameters at a bound: beyond its bounds a law is not physical",
+        "largest number of an effect's parameters that the logs put at a bound: beyond its bounds a law is not physical",
         "bounds are in the code of each effect",
     )
     excess: float = _rule(

@@ -54,7 +54,7 @@ def rules_page() -> str:
             "Thresholds of all decisions of a loop (`fitting/attribution/rules.py`). A report has each rule with its",
             "statistic and its outcome, under `rules` and in the section *Why this decision*. There is one more rule,",
             "`imperfection`. Each form of an effect states the threshold: what its law may get wrong, as a share of",
-            "what it has removed.",
+            "what it has removed. It does not apply where only noise is left beside the further effect.",
             "",
             "| rule | threshold | unit | meaning | source |",
             "|---|---|---|---|---|",

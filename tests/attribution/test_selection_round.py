@@ -96,6 +96,33 @@ def test_lasting_share_is_that_of_the_gain_over_whole_stretches(
     assert of_a_trial.lasting_share(Creep(k=1.0, tau=1.0, span=1.0), after, before) == 1.0
 
 
+def test_gain_over_whole_stretches_is_that_of_the_principal_output(verdicts, monkeypatch: pytest.MonkeyPatch):
+    """A motor that nothing holds drifts with the smallest error of a torque, which says nothing about a law."""
+    trial, _ = verdicts
+
+    def with_errors(motor: float, twist: float) -> Trial:
+        covariance = jnp.diag(jnp.asarray([motor, twist]) ** 2)
+        return replace(trial, held_out=replace(trial.held_out, covariance=covariance))
+
+    monkeypatch.setattr(of_a_trial, "over_whole_stretches", lambda f, **_: f)
+    monkeypatch.setattr(of_a_trial, "without_gaps", lambda f: f)
+    monkeypatch.setattr(of_a_trial, "follows", lambda f: True)
+    before, drifting, wrong, lost = (with_errors(*e) for e in ((9.0, 8.0), (3.0, 1.0), (0.1, 4.0), (1.0, np.nan)))
+    gains = of_a_trial.long_gains(before, [drifting, wrong, lost])
+    assert gains == pytest.approx([np.log(8.0), np.log(2.0), -np.inf])
+
+
+@pytest.mark.parametrize(("white", "excused", "least"), [(False, True, 0.02), (True, True, 0.0), (False, False, 0.0)])
+def test_laws_beside_which_only_noise_is_left_are_exact(
+    verdicts, white: bool, excused: bool, least: float, monkeypatch: pytest.MonkeyPatch
+):
+    before, found = verdicts
+    monkeypatch.setattr(attribution, "imperfection", lambda kept: 0.02)
+    monkeypatch.setattr(attribution, "leaves_white_noise", lambda fit: white)
+    standing = Standing(before, before, measurement_noise(before.training), excused=excused)
+    assert attribution._evidence(found["torque_bias"], standing).imperfection == least
+
+
 @pytest.mark.parametrize(
     ("bias_long", "creep_long", "leader"),
     [

@@ -1,6 +1,7 @@
 """Identifiability, compared with other logs, with refits at other values and with closed-form structure."""
 
 import re
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -10,18 +11,21 @@ import rig
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
 from fitting.estimation.problem import Segmentation
+from fitting.uncertainty import identifiability as module
 from fitting.uncertainty.held_values import _held_one
 from fitting.uncertainty.identifiability import (
     at_bound,
     identifiability,
     needed_samples,
     needed_twist,
+    outside_domain,
     reason,
 )
-from fitting.uncertainty.standard_errors import Estimate, uncertainty
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty, uncertainty
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.effects.learned import LearnedMeshTorque
 from hdjax.effects.learned_axes import LinearAxis
+from hdjax.effects.presliding import LuGreMotorFriction
 from hdjax.parameters import ParameterInfo
 
 COUNT, HORIZON, NOISE = 1000, 128, 2e-3
@@ -204,6 +208,26 @@ def test_bounds_in_si_units_are_ignored_for_a_reduced_log():
     assert (
         "to 1e-06 [x], its bound at zero" in identifiability(gone, uncertainty(found)).bounds["bouc_wen.memory_twist"]
     )
+
+
+@pytest.mark.parametrize(
+    ("excess", "ci95", "outside"),
+    [
+        (0.5, (0.4, 0.6), []),
+        (1e9, (1e8, 1e10), ["lugre_motor_friction.excess"]),  # the data need a larger one than there are
+        (1e9, (1e-9, 1e27), []),  # they do not determine it
+    ],
+)
+def test_only_what_the_data_determine_can_leave_its_domain(
+    small_twist_fit: tuple[Fit, Estimate], excess: float, ci95: tuple[float, float], outside: list[str], monkeypatch
+):
+    friction = LuGreMotorFriction(T_c=0.1, excess=excess, omega_s=0.1, bend=1e-3, tau=1e-3, settling=1e-4)
+    found, alpha = small_twist_fit
+    found = eqx.tree_at(lambda f: f.model, found, rig.drive_model().with_effects(friction))
+    estimate = replace(alpha, path="lugre_motor_friction.excess", value=excess, ci95=ci95)
+    known = Uncertainty({estimate.path: estimate}, *[np.eye(1)] * 3)
+    monkeypatch.setattr(module, "uncertainty", lambda fit, **_: known)
+    assert outside_domain(found, "lugre_motor_friction") == outside
 
 
 @pytest.mark.parametrize(
