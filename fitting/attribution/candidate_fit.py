@@ -25,6 +25,8 @@ from hdjax.effects import Effect
 _TRIAL_STEPS = 25
 # Iterations from a fit of the same model.
 _CONTINUED = Strategy(_TRIAL_STEPS, begin_anew_above=np.inf, retry_states=False)
+# Most further passes of a fit; LuGre friction takes three.
+_MOST_PASSES = 6
 # Iterations that rank the starts.
 _FIRST_STEPS = replace(_CONTINUED, max_steps=12, give_up_above=-np.inf)
 # Longest delay or lag of the torque [s].
@@ -78,13 +80,22 @@ def attempt(
 
 
 def continued(trial: Trial, study: Study) -> Trial:
-    """A trial after a further pass of its fit; unchanged where that gains nothing. A shape that the data don't
-    determine may run to a bound: that gains nothing on held-out data.
+    """A trial after further passes of its fit, as long as they gain something: what is left to gain would be taken for
+    a further effect. A shape that the data don't determine may run to a bound: that gains nothing on held-out data.
 
     Args:
         trial: the current one.
         study: the data and their segmentation.
     """
+    for _ in range(_MOST_PASSES):
+        before, trial = trial, _after_a_pass(trial, study)
+        if trial is before:
+            break
+    return trial
+
+
+def _after_a_pass(trial: Trial, study: Study) -> Trial:
+    """A trial after a further pass of its fit; itself where that gains nothing."""
     training = trained(trial.model, study, trial.hold, trial.training, _CONTINUED)
     if training.objective > trial.training.objective - LEAST_PROGRESS:
         return trial

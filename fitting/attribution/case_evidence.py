@@ -28,7 +28,7 @@ class EffectEvidence:
         imperfection: error that the laws of preceding effects may cause, likewise.
         strength_errors: standard errors by which its most significant strength differs from zero.
         over_noise: log likelihood ratio against noise; infinite where noise does not explain the residual.
-        at_bounds: number of its parameters that the data put at a bound.
+        at_bounds: number of its parameters that ended at a bound.
     """
 
     name: str

@@ -17,7 +17,7 @@ from fitting.estimation.base_fit import base_fit, is_held
 from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import mostly_lost
 from fitting.estimation.outliers import with_weights
-from fitting.uncertainty.identifiability import outside_domain
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.uncertainty.one_side import leaves_only_noise, with_mesh_priors
 from hdjax import Hold, Model
@@ -139,7 +139,7 @@ def _without_superfluous(
 ) -> tuple[Trial, list[str], dict[str, Trial]]:
     """The model without superfluous effects, their names, and the model without each of the others. An effect, or a
     hold, is superfluous if its removal hardly changes the error on selection data. The last one may be as well, where
-    the others were completed beside it. An effect with a parameter that has left its domain since is dropped in any
+    the others were completed beside it. An effect with a parameter that has ended at a bound since is dropped in any
     case.
 
     Args:
@@ -149,7 +149,7 @@ def _without_superfluous(
         study: the data and their segmentation.
     """
     effects = {e.name for e in current.model.effects}
-    dropped = [name for name in names if name in effects and outside_domain(current.training, name)]
+    dropped = [name for name in names if name in effects and parameters_at_bounds(current.model, name)]
     if dropped:
         current = base if len(dropped) == len(names) else refitted_without(dropped, current, base, study)
     without, names = {}, [name for name in names if name not in dropped]

@@ -14,7 +14,7 @@ from fitting.attribution.case_evidence import RoundEvidence
 from fitting.attribution.selection_round import Round, Verdict, simplest_first, with_ties
 from fitting.attribution.study import Study
 from fitting.attribution.support import nonzero_effects
-from fitting.uncertainty.identifiability import outside_domain
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 
 
@@ -83,5 +83,5 @@ def _instead_of(winner: Verdict, other: Verdict, effect: Effect, current: Trial,
 
 
 def _is_determined(trial: Trial, name: str) -> bool:
-    """Whether an effect has a significantly nonzero strength and no parameter outside its domain."""
-    return not outside_domain(trial.training, name) and bool(nonzero_effects(trial.training, {name}))
+    """Whether an effect has a significantly nonzero strength and no parameter at a bound."""
+    return not parameters_at_bounds(trial.model, name) and bool(nonzero_effects(trial.training, {name}))

@@ -45,8 +45,8 @@ class DecisionRules:
     at_bounds: float = _rule(
         0.0,
         "parameters",
-        "largest number of an effect's parameters that the logs put at a bound: beyond its bounds a law is not physical",
-        "bounds are in the code of each effect",
+        "largest number of an effect's parameters at a bound: beyond its bounds a law is not physical",
+        "bounds are in the code of each effect; after the final fit those that the logs determine count",
     )
     excess: float = _rule(
         1.5, "times the noise", "largest residual that counts as noise", "the noise is estimated to a few per cent"

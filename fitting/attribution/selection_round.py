@@ -26,7 +26,7 @@ from fitting.attribution.support import (
 )
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.first_order.motion import place_of
-from fitting.uncertainty.identifiability import outside_domain
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
@@ -104,7 +104,7 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
         imperfection=imperfection(kept) if standing.excused and not leaves_white_noise(trial.training) else 0.0,
         strength_errors=min(errors.values(), default=np.inf),
         over_noise=standing.over_noise(trial),
-        at_bounds=len(outside_domain(trial.training, verdict.name)),
+        at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
     )
 
 

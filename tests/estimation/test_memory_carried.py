@@ -53,7 +53,7 @@ def test_carried_hidden_states_recover_the_springs_of_maxwell_slip():
     paths = ("omega_0", "alpha", "mu", *(f"{guess.name}.{name}" for name in truth))
     model = rig.reduced_model().with_effects(guess)
     short = fit(
-        model, [Stretch(logged, 0, COUNT)], paths, Segmentation(HORIZON, substeps=4), strategy=Strategy(max_steps=25)
+        model, [Stretch(logged, 0, COUNT)], paths, Segmentation(HORIZON, substeps=4), strategy=Strategy(max_steps=10)
     )
     carried = with_memory_carried(short)
     assert carried.horizon == HORIZON and carried.principal_std < 0.75 * short.principal_std
