@@ -13,7 +13,7 @@ from fitting.attribution.selection_round import Round, look
 from fitting.attribution.study import Data, Setting, Study
 from fitting.attribution.support import Standing, leaves_imperfection
 from fitting.errors import DataError
-from fitting.estimation.base_fit import base_fit, is_held
+from fitting.estimation.base_fit import base_fit, is_held, leaves_white_noise
 from fitting.estimation.encoder_delay import delay_of_load
 from fitting.estimation.estimate import mostly_lost
 from fitting.estimation.outliers import with_weights
@@ -93,13 +93,16 @@ def search_effects(
     """
     current, rounds, noise, limited = base, [], measurement_noise(base.training), False
     while len(rounds) - len(_replaced(rounds)) < max_effects:
-        offered, enough = catalogue, False
+        offered, exempt = catalogue, None
         if rounds:
             enough, noise = leaves_imperfection(current, base, noise)
-            if enough and not (offered := study.beside_imperfect(current.training, catalogue)):
-                break
+            exempt = study.beside_imperfect(current.training, catalogue) if enough else None
+            if enough and leaves_white_noise(current.training):
+                if not exempt:
+                    break
+                offered = exempt
         turn = replace(study, seed=study.seed + len(rounds))
-        this = look(Standing(current, base, noise, excused=not enough), turn, catalogue=offered)
+        this = look(Standing(current, base, noise, exempt=exempt), turn, catalogue=offered)
         rounds.append(this)
         if not this.accepted:
             break

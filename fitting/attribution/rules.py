@@ -42,6 +42,12 @@ class DecisionRules:
         "least distance of a strength from zero",
         "p-value of one percent over a hundred forms and shapes (Bonferroni)",
     )
+    law_errors: float = _rule(
+        2.0,
+        "times the imperfection",
+        "least error that a further effect removes, unless it leaves only noise: less, an inexact law may leave",
+        "two standard deviations; LuGre friction left 1.8 times in logs of MuJoCo (`benchmarks/mujoco_rig.py`)",
+    )
     at_bounds: float = _rule(
         0.0,
         "parameters",

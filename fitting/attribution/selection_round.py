@@ -19,7 +19,6 @@ from fitting.attribution.shortlist import first_of_each_family, further_forms, p
 from fitting.attribution.study import Study
 from fitting.attribution.support import (
     Standing,
-    imperfection,
     is_plausible,
     share_of_removed,
     strength_errors,
@@ -94,14 +93,12 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
     assert trial is not None
     own = {verdict.name} & {e.name for e in trial.model.effects}
     errors = strength_errors(trial.training, own)
-    # A law that is replaced is not excused by its imperfection, nor are laws beside which only noise is left.
-    kept = [e for e in standing.before.model.effects if e.name in {other.name for other in trial.model.effects}]
     return EffectEvidence(
         name=verdict.name,
         gain=verdict.gain,
         p_value=verdict.p_value,
         removed=share_of_removed(trial, standing.before, standing.base),
-        imperfection=imperfection(kept) if standing.excused and not leaves_white_noise(trial.training) else 0.0,
+        imperfection=standing.imperfection(trial, verdict.name),
         strength_errors=min(errors.values(), default=np.inf),
         over_noise=standing.over_noise(trial),
         at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
@@ -121,7 +118,7 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=study.seed, side=study.side)
     refits = _Refits(before, study)
     refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
-    found = [*refits.forms(screened), *(refits.holds(screened) if standing.excused else [])]
+    found = [*refits.forms(screened), *(refits.holds(screened) if standing.exempt is None else [])]
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     found, tied = with_ties(found)
     rivals: tuple[Rival, ...] = ()

@@ -1,6 +1,6 @@
 """Evidence for a refitted effect: significance of its strength, removed error, plausibility of its values."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import NoiseEvidence
 from fitting.attribution.decisions import only_noise
 from fitting.attribution.rules import RULES
+from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import Fit, lost
 from fitting.estimation.free_parameters import effect_paths, strength_paths
 from fitting.uncertainty.measurement_noise import MeasurementNoise
@@ -125,11 +126,35 @@ class Standing:
         before: the current model.
         base: the model without any effect.
         noise: of the measured outputs.
-        excused: whether an inexact law of its effects may explain what it leaves.
+        exempt: None where inexact laws of its effects can't explain what it leaves. Where they may, the forms that are
+            accepted all the same; of any other one it is required that only noise is left.
     """
 
-    def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise, *, excused: bool = True) -> None:
-        self.before, self.base, self.noise, self.excused = before, base, noise, excused
+    def __init__(
+        self,
+        before: Trial,
+        base: Trial,
+        noise: MeasurementNoise,
+        *,
+        exempt: Sequence[type[Effect]] | None = None,
+    ) -> None:
+        self.before, self.base, self.noise, self.exempt = before, base, noise, exempt
+
+    def imperfection(self, trial: Trial, name: str) -> float:
+        """What a further effect must remove at least: more than the other effects' laws may leave, as a share of what
+        they have removed.
+
+        A law that is replaced has none, nor have laws where the further effect leaves only noise.
+
+        Args:
+            trial: the model with the further effect.
+            name: of that effect.
+        """
+        completes = leaves_white_noise(trial.training) and not leaves_white_noise(self.before.training)
+        if completes or name in {form.name for form in self.exempt or ()}:
+            return 0.0
+        there = {e.name for e in trial.model.effects}
+        return RULES.law_errors * imperfection(e for e in self.before.model.effects if e.name in there)
 
     @cached_property
     def left(self) -> NoiseModel | None:

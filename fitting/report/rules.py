@@ -10,7 +10,7 @@ from fitting.attribution.rules import rules_table
 _APPLIED = {
     "imperfection": {
         "unit": "share of rms",
-        "meaning": "possible error of earlier effects' laws, relative to what they removed",
+        "meaning": "what earlier effects' laws may leave, relative to what they removed",
     },
     "tie_level": {
         "unit": "standard errors",
@@ -53,8 +53,8 @@ def rules_page() -> str:
             "",
             "Thresholds of all decisions of a loop (`fitting/attribution/rules.py`). A report has each rule with its",
             "statistic and its outcome, under `rules` and in the section *Why this decision*. There is one more rule,",
-            "`imperfection`. Each form of an effect states the threshold: what its law may get wrong, as a share of",
-            "what it has removed. It does not apply where only noise is left beside the further effect.",
+            "`imperfection`. Each form of an effect states what its law may get wrong, as a share of what it has removed.",
+            "A further effect must remove `law_errors` times as much, unless it leaves only noise.",
             "",
             "| rule | threshold | unit | meaning | source |",
             "|---|---|---|---|---|",

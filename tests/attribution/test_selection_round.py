@@ -112,14 +112,24 @@ def test_gain_over_whole_stretches_is_that_of_the_principal_output(verdicts, mon
     assert gains == pytest.approx([np.log(8.0), np.log(2.0), -np.inf])
 
 
-@pytest.mark.parametrize(("white", "excused", "least"), [(False, True, 0.02), (True, True, 0.0), (False, False, 0.0)])
-def test_laws_beside_which_only_noise_is_left_are_exact(
-    verdicts, white: bool, excused: bool, least: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("before_is_white", "white", "exempt", "least"),
+    [
+        (False, False, None, 0.02),
+        (False, True, None, 0.0),  # what leaves only noise shows that the laws are exact
+        (True, True, None, 0.02),  # only noise was left before
+        (False, False, (Creep,), 0.02),
+        (False, False, (TorqueBias,), 0.0),
+        (False, True, (Creep,), 0.0),
+    ],
+)
+def test_further_effect_must_remove_more_than_laws_may_get_wrong_unless_only_noise_is_left(
+    verdicts, before_is_white: bool, white: bool, exempt, least: float, monkeypatch: pytest.MonkeyPatch
 ):
     before, found = verdicts
-    monkeypatch.setattr(attribution, "imperfection", lambda kept: 0.02)
-    monkeypatch.setattr(attribution, "leaves_white_noise", lambda fit: white)
-    standing = Standing(before, before, measurement_noise(before.training), excused=excused)
+    monkeypatch.setattr(support, "imperfection", lambda kept: 0.01)
+    monkeypatch.setattr(support, "leaves_white_noise", lambda fit: before_is_white if fit is before.training else white)
+    standing = Standing(before, before, measurement_noise(before.training), exempt=exempt)
     assert attribution._evidence(found["torque_bias"], standing).imperfection == least
 
 
