@@ -46,7 +46,7 @@ class DecisionRules:
         2.0,
         "times the imperfection",
         "least error that a further effect removes, unless it leaves only noise: less, an inexact law may leave",
-        "two standard deviations; LuGre friction left 1.8 times in logs of MuJoCo (`benchmarks/mujoco_rig.py`)",
+        "two standard deviations",
     )
     at_bounds: float = _rule(
         0.0,
