@@ -81,7 +81,7 @@ def attempt(
 
 def continued(trial: Trial, study: Study) -> Trial:
     """A trial after further passes of its fit, as long as they gain something: what is left to gain would be taken for
-    a further effect. A shape that the data don't determine may run to a bound: that gains nothing on held-out data.
+    a further effect. A shape runs to a bound only where that gains something on held-out data.
 
     Args:
         trial: the current one.
@@ -97,15 +97,21 @@ def continued(trial: Trial, study: Study) -> Trial:
 def _after_a_pass(trial: Trial, study: Study) -> Trial:
     """A trial after a further pass of its fit; itself where that gains nothing."""
     training = trained(trial.model, study, trial.hold, trial.training, _CONTINUED)
+    if ran_away := _at_bounds(training.model) - _at_bounds(trial.model):
+        # A shape that the data don't determine stays where it was.
+        kept = training.model.replace({path: trial.model.get(path) for path in ran_away})
+        strategy = replace(_CONTINUED, hold_parameters=tuple(sorted(ran_away)))
+        held = trained(kept, study, trial.hold, trial.training, strategy).with_all_free()
+        training = held if held.objective < training.objective + RULES.least_gain else training
     if training.objective > trial.training.objective - LEAST_PROGRESS:
         return trial
     found = _judged(training, study, trial.hold)
-    runs_away = _count_at_bounds(found.model) > _count_at_bounds(trial.model)
+    runs_away = not _at_bounds(found.model) <= _at_bounds(trial.model)
     return trial if runs_away and found.gain_over(trial) < RULES.least_gain else found
 
 
-def _count_at_bounds(model: Model) -> int:
-    return sum(len(parameters_at_bounds(model, effect.name)) for effect in model.effects)
+def _at_bounds(model: Model) -> set[str]:
+    return {path for effect in model.effects for path in parameters_at_bounds(model, effect.name)}
 
 
 def challenge(model: Model, study: Study, hold: Hold, *, champion: Trial) -> Trial | None:

@@ -9,8 +9,9 @@ from fitting.attribution import candidate_fit
 from fitting.attribution.candidate_fit import attempt, challenge, completed, continued, first_pass, halo_for
 from fitting.attribution.study import Data, Setting, Study
 from fitting.estimation.base_fit import base_fit
+from fitting.estimation.estimate import Fit, Strategy
 from fitting.estimation.experiment import split
-from hdjax import Hold
+from hdjax import Hold, Model
 from hdjax.effects.friction import CoulombFriction
 
 HOLD: Hold = "zero-order"
@@ -58,11 +59,28 @@ def test_continued_fit_takes_a_shape_beyond_its_bound_only_for_a_gain(
 ):
     before, study = base_trial_and_study
     trial = attempt(with_friction(before.model, 50.0, 0.3), study, HOLD)
-    training = replace(trial.training, objective=trial.training.objective - 0.1)
+    model = trial.model.replace({"coulomb_friction.v_0": -1.0})
+    training = replace(trial.training, objective=trial.training.objective - 0.1, model=model)
     held_out = replace(trial.held_out, objective=trial.held_out.objective - gain)
-    beyond = replace(
-        trial, model=trial.model.replace({"coulomb_friction.v_0": -1.0}), training=training, held_out=held_out
-    )
+    beyond = replace(trial, model=model, training=training, held_out=held_out)
     monkeypatch.setattr(candidate_fit, "trained", lambda *_: training)
     monkeypatch.setattr(candidate_fit, "_judged", lambda *_: beyond)
     assert continued(trial, study) is (beyond if taken else trial)
+
+
+def test_shape_that_the_data_do_not_determine_stays_where_it_was(base_trial_and_study, monkeypatch: pytest.MonkeyPatch):
+    before, study = base_trial_and_study
+    trial = attempt(with_friction(before.model, 50.0, 0.3), study, HOLD)
+
+    def fitted(model: Model, study: Study, hold: Hold, near: Fit, strategy: Strategy) -> Fit:
+        """A pass in which the corner runs away, unless it is held."""
+        held = isinstance(strategy.hold_parameters, tuple)
+        assert not held or strategy.hold_parameters == ("coulomb_friction.v_0",)
+        model = model if held else model.replace({"coulomb_friction.v_0": -1.0})
+        return replace(trial.training, model=model, objective=trial.training.objective - (0.0999 if held else 0.1))
+
+    monkeypatch.setattr(candidate_fit, "trained", fitted)
+    monkeypatch.setattr(candidate_fit, "_judged", lambda fit, *_: replace(trial, model=fit.model, training=fit))
+    found = continued(trial, study)
+    assert found is not trial
+    assert float(found.model.effects[0].v_0) == float(trial.model.effects[0].v_0)
