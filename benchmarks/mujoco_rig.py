@@ -130,7 +130,7 @@ def row(rig: Rig, loop: Callable[[Rig], fitting.LoopResult]) -> str:
     named = [f for f in found.effects["family"].to_list() if f != "unknown"]
     right = "yes" if sorted(named) == sorted(HIDDEN[rig.kind]) else "no: " + (" and ".join(named) or "nothing")
     K = found.report["after"]["parameters"]["K"]
-    error = found.rmse["test"] / found.report["noise"]
+    error = found.rmse["test"] / found.report["noise"][found.report["output"]]
     low, high = K["ci95"]
     off = f"{100 * abs(K['value'] / rig.K - 1):.2g} %"
     inside = "withheld" if low is None else "yes" if low <= rig.K <= high else "no"
