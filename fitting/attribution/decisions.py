@@ -98,7 +98,9 @@ def compete(best: Rival, others: Sequence[Rival]) -> tuple[Rival, ...]:
 
 
 def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, tuple[str, ...]]:
-    """The chosen candidate: of those with equal gain over whole stretches the simplest, plausible ones first.
+    """The chosen candidate: of those with equal gain the simplest, plausible ones first.
+
+    Gains are compared over whole stretches; where these are equal, over short segments, in which less accumulates.
 
     Args:
         rivals: the competing candidates.
@@ -107,9 +109,13 @@ def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival
     Returns:
         The candidate, and the names of those with equal gain.
     """
-    most = max(r.long_gain for r in rivals)
-    least = most - max(rules.least_gain, rules.same_gain * abs(most))
-    close = [r for r in rivals if r.long_gain >= least]
+
+    def least(most: float) -> float:
+        return most - max(rules.least_gain, rules.same_gain * abs(most))
+
+    close = [r for r in rivals if r.long_gain >= least(max(r.long_gain for r in rivals))]
+    least_gain = least(max(r.gain for r in close))
+    close = [r for r in close if r.tied or r.gain >= least_gain]
     first = min(close, key=lambda r: (not r.plausible, r.parameters, r.states, -r.gain))
     return first, tuple(r.name for r in close)
 

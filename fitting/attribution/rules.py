@@ -34,7 +34,10 @@ class DecisionRules:
         "convention",
     )
     same_gain: float = _rule(
-        0.02, "share of the best gain", "gains over whole stretches that differ by less are equal", _UNDECLARED
+        0.02,
+        "share of the best gain",
+        "gains that differ by less are equal, over whole stretches and over short segments",
+        _UNDECLARED,
     )
     strength_errors: float = _rule(
         3.9,

@@ -96,6 +96,9 @@ def test_simplest_plausible_candidate_leads_among_equal_gains():
     assert leader([other, one])[0].name == "one"
     assert leader([replace(other, long_gain=3.0), one])[0].name == "other"
     assert leader([other, replace(one, plausible=False)])[0].name == "other"
+    # Equal over whole stretches, where errors accumulate, but not over short segments.
+    assert leader([other, replace(one, gain=0.7, tied=False)]) == (other, ("other",))
+    assert leader([other, replace(one, gain=0.99, tied=False)])[0].name == "one"
 
 
 @pytest.mark.parametrize(
