@@ -19,10 +19,10 @@ import numba
 import numpy as np
 from scipy.optimize import least_squares
 
+from fitting.estimation.arrow_system import normal_equations
 from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Experiment, Stretch
 from fitting.estimation.free_parameters import base_paths
-from fitting.estimation.levenberg_marquardt import normal_equations
 from fitting.estimation.problem import Segmentation, natural_frequency, short_horizon, suggested_substeps
 from fitting.estimation.residual import Products, blocks, residual
 from fitting.estimation.starting_values import starting_models

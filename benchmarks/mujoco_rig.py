@@ -9,16 +9,15 @@ constraint, which is not quite a law of the catalogue.
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import mujoco
 import numpy as np
+import polars as pl
 from scipy.signal import cont2discrete
 
 import fitting
-from fitting.files import write_whole
 
 SUBSTEPS = 20
 # Time constant of the friction constraints [s]: MuJoCo's own, 0.02 s, is slower than a drive reverses.
@@ -122,11 +121,21 @@ class Rig:
         return {"drive": known, "signals": {"torque_hold": "zero-order"}}
 
 
-def row(rig: Rig, loop: Callable[[Rig], fitting.LoopResult]) -> str:
-    """What the loop finds, as a row of the table."""
+def row(rig: Rig, out: Path | None) -> str:
+    """What the loop finds, as a row of the table.
+
+    Args:
+        rig: the drive.
+        out: folder for its logs and its report, if any.
+    """
+    logs = {name: rig.simulated(seconds) for name, seconds in SECONDS.items()}
     begin = time.perf_counter()
-    found = loop(rig)
+    found = fitting.close_loop(fitting.load([logs["train_1"], logs["train_2"]], rig.drive(), test=logs["test"]))
     seconds = time.perf_counter() - begin
+    if out is not None:
+        found.save(out)
+        for name, log in logs.items():
+            pl.DataFrame(log).write_csv(out / f"{name}.csv")
     named = [f for f in found.effects["family"].to_list() if f != "unknown"]
     right = "yes" if sorted(named) == sorted(HIDDEN[rig.kind]) else "no: " + (" and ".join(named) or "nothing")
     K = found.report["after"]["parameters"]["K"]
@@ -146,25 +155,13 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=HIDDEN, default=list(HIDDEN))
     parser.add_argument("--out", type=Path, help="folder for the logs and reports")
     args = parser.parse_args()
-
-    def loop(rig: Rig) -> fitting.LoopResult:
-        logs = {name: rig.simulated(seconds) for name, seconds in SECONDS.items()}
-        found = fitting.close_loop(fitting.load([logs["train_1"], logs["train_2"]], rig.drive(), test=logs["test"]))
-        if args.out is not None:
-            folder = args.out / f"{rig.kind}-{args.seed}-{draw}"
-            found.save(folder)
-            for name, log in logs.items():
-                table = np.column_stack(list(log.values()))
-                lines = [",".join(log), *(",".join(f"{value:.12g}" for value in values) for values in table)]
-                write_whole({folder / f"{name}.csv": "\n".join(lines) + "\n"})
-        return found
-
     print("| kind | decision | named rightly | error of K | in its interval | test error over noise | seconds |")
     print("|---|---|---|---|---|---|---|")
     for kind in args.kinds:
         for draw in range(args.draws):
             random = np.random.default_rng([args.seed, draw, *kind.encode()])
-            print(row(Rig(kind, random), loop), flush=True)
+            out = None if args.out is None else args.out / f"{kind}-{args.seed}-{draw}"
+            print(row(Rig(kind, random), out), flush=True)
 
 
 if __name__ == "__main__":

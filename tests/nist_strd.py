@@ -14,7 +14,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt, normal_equations
+from fitting.estimation.arrow_system import normal_equations
+from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.residual import Blocks, LinearisedResidual, Products, Unknowns
 
 SAMPLES, PARAMETERS = 250, 9

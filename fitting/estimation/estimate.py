@@ -17,6 +17,7 @@ from fitting.estimation.late_readings import aligned, is_aligned
 from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
 from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
+from fitting.estimation.separate_states import Damping
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from fitting.estimation.weighing import Shown, weighed
 from hdjax import Model
@@ -77,7 +78,7 @@ class Strategy:
     retry_states: bool = True
     give_up_above: float = np.inf
 
-    def solve(self, problem: Problem, begin: Unknowns, damping: float | Float[np.ndarray, " segments"]) -> Solution:
+    def solve(self, problem: Problem, begin: Unknowns, damping: Damping) -> Solution:
         """One pass: least squares with fixed weights, by [`fitting.estimation.solve.solve`][]."""
         return solve(problem, begin, self.max_steps, damping, least_progress=self.least_progress)
 

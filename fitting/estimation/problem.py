@@ -29,8 +29,8 @@ _SETTLINGS = 2.0
 STEP_ANGLE = 0.15
 """A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
 _AT_CORNERS = 8
-"""Multiple of the suggested number of steps that only corners of a nonsmooth model ask for: there Bosh3 errs as much as
-Tsit5 does (under LuGre friction 0.0197 and 0.0186 standard errors), and takes half the time."""
+"""Multiple of the suggested number of steps that only corners of a nonsmooth model ask for: there a method's
+order does not count, so that Bosh3 errs as much as Tsit5 does in twice the time."""
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.estimation.arrow_system import solve_scaled
 from fitting.estimation.levenberg_marquardt import (
-    CAUTIOUS,
     KEPT,
     LATEST,
     LEAST_DAMPING,
@@ -15,12 +15,15 @@ from fitting.estimation.levenberg_marquardt import (
     SHORTER,
     SLIGHT,
     WELL,
-    solve_scaled,
+    bolder_after,
 )
 from fitting.estimation.residual import Products, Unknowns
 
 Look = Callable[[Unknowns], tuple[Products, Array | np.ndarray]]
 """The normal equations at some unknowns, and the rows of the residual."""
+
+Damping = float | Float[np.ndarray, " segments"]
+"""Damping of a step, relative to the diagonals of J^T J; of each segment where these are problems of their own."""
 
 
 class Ended(NamedTuple):
@@ -31,24 +34,18 @@ class Ended(NamedTuple):
         rows: of their residual.
         success: whether the next step promised next to nothing.
         steps: how many were taken.
-        damping: of the next step, of each segment where these are problems of their own.
+        damping: of the next step.
     """
 
     unknowns: Unknowns
     rows: Float[Array | np.ndarray, "segments rows"]
     success: bool
     steps: int
-    damping: float | Float[np.ndarray, " segments"]
+    damping: Damping
 
 
 def solve_states(
-    look: Look,
-    start: Unknowns,
-    max_steps: int,
-    damping: float | Float[np.ndarray, " segments"],
-    *,
-    rtol: float,
-    least_progress: float,
+    look: Look, start: Unknowns, max_steps: int, damping: Damping, *, rtol: float, least_progress: float
 ) -> Ended:
     """Fit the initial state of each segment with fixed parameters.
 
@@ -83,7 +80,7 @@ def solve_states(
         taken = (changed <= KEPT * promised) | (np.abs(changed) < 0.5 * SLIGHT * squares)
         well = changed < WELL * promised
         dampings = dampings / np.where(taken, np.where(well, bolder, 1.0), SHORTER)
-        bolder = np.where(taken, np.where(well, np.minimum(CAUTIOUS * bolder, LONGER), bolder), CAUTIOUS)
+        bolder = bolder_after(taken, well, bolder)
         dampings = np.maximum(dampings, LEAST_DAMPING)
         states[taken], products[taken], rows[taken] = ahead[taken], seen.products[taken], np.asarray(rows_ahead)[taken]
     return Ended(Unknowns(start.parameters, states), rows, bool(done.all()), steps, dampings)

@@ -13,7 +13,7 @@ from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.machine_code import task
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
-from fitting.estimation.separate_states import Ended, Look, solve_states
+from fitting.estimation.separate_states import Damping, Ended, Look, solve_states
 from hdjax.compilation import jit_small, on_host
 from hdjax.lanes import on_one_device, placed_like
 
@@ -54,16 +54,11 @@ class Solution(eqx.Module):
     left_over: LeftOver
     success: bool = eqx.field(static=True)
     steps: int = eqx.field(static=True)
-    damping: float | Float[np.ndarray, " segments"]
+    damping: Damping
 
 
 def solve(
-    problem: Problem,
-    start: Unknowns,
-    max_steps: int,
-    damping: float | Float[np.ndarray, " segments"],
-    *,
-    least_progress: float = 0.0,
+    problem: Problem, start: Unknowns, max_steps: int, damping: Damping, *, least_progress: float = 0.0
 ) -> Solution:
     """Iterate to the least squares.
 
@@ -90,12 +85,7 @@ def solve(
 
 
 def _solve_together(
-    problem: Problem,
-    look: Look,
-    best: Unknowns,
-    max_steps: int,
-    damping: float | Float[np.ndarray, " segments"],
-    least_progress: float,
+    problem: Problem, look: Look, best: Unknowns, max_steps: int, damping: Damping, least_progress: float
 ) -> Ended:
     """The iteration where segments share parameters or are joined."""
     segments = problem.segments

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.estimation.arrow_system import normal_equations, project
 from fitting.estimation.engines import blocks_inside
 from fitting.estimation.estimate import Fit
-from fitting.estimation.levenberg_marquardt import normal_equations, project
 from fitting.estimation.residual import Problem, Products, Unknowns
 from fitting.uncertainty.standard_errors import Uncertainty
 from hdjax.where import where

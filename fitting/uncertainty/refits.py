@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from fitting.estimation.arrow_system import normal_equations
 from fitting.estimation.engines import linearise, residual_inside, with_engine
 from fitting.estimation.estimate import Fit
-from fitting.estimation.levenberg_marquardt import normal_equations
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
 from hdjax.lanes import jit_lanes
 

@@ -9,10 +9,11 @@ import pytest
 from scipy.optimize import least_squares
 
 import rig
+from fitting.estimation.arrow_system import normal_equations, project
 from fitting.estimation.engines import residual_and_products
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths, free_parameters
-from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt, normal_equations, project
+from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.problem import initial_states
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns, blocks, residual
 from fitting.estimation.segments import cut
