@@ -155,6 +155,7 @@ class LuGreMeshFriction(_LuGre, MeshTorqueEffect):
 
     family: ClassVar[str] = "coulomb_friction"
     name: ClassVar[str] = "lugre_mesh_friction"
+    drawn_against: ClassVar[str | None] = "v"
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:

@@ -202,6 +202,7 @@ def test_lugre_friction_at_constant_speed_is_the_stribeck_curve(form, omega):
 @pytest.mark.parametrize("v", (-0.3, 0.02))
 def test_lugre_friction_of_the_mesh_at_constant_rate_is_a_stribeck_curve(v: float):
     """A torque with the twist's rate, as that of the spring with the twist; viscous friction of the mesh is B_sp."""
+    assert LuGreMeshFriction.drawn_against == "v"
     effect = LuGreMeshFriction(T_c=0.2, excess=0.5, omega_s=0.05, bend=1e-5, tau=0.002, settling=1e-5)
     rate = np.full((400, 3), v)
     step = 0.3 * np.hypot(1e-5 / v, 1e-5)
